@@ -1,0 +1,3 @@
+"""PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
+
+__version__ = "0.1.0"
