@@ -1,0 +1,24 @@
+"""Continuous normalizing flows for policies, in plain torch: fields, paths, solvers and times."""
+
+from sb3_policyflow.flows.paths import PATHS, Path, Rectified, StochasticInterpolant, TrigFlow
+from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
+from sb3_policyflow.flows.times import TIME_SAMPLERS, GridTimes, TimeSampler, UniformTimes
+from sb3_policyflow.flows.velocity import INITIALISATIONS, FourierTimeEmbedding, VelocityField
+
+__all__ = [
+    "INITIALISATIONS",
+    "PATHS",
+    "SOLVERS",
+    "TIME_SAMPLERS",
+    "FourierTimeEmbedding",
+    "GridTimes",
+    "Path",
+    "Rectified",
+    "Solver",
+    "StochasticInterpolant",
+    "TimeSampler",
+    "TrigFlow",
+    "UniformTimes",
+    "VelocityField",
+    "integrate",
+]

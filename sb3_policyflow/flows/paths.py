@@ -1,0 +1,178 @@
+"""Interpolation paths between a latent and an end point (paper, table of interpolation paths).
+
+A path says where between z and phi the velocity is looked at, and how the score of the points on
+it follows from the velocity.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch as th
+
+
+class PathCoefficients(NamedTuple):
+    """Coefficients of x_t = latent z + endpoint phi + noise h, each of the shape of the times."""
+
+    latent: th.Tensor
+    endpoint: th.Tensor
+    noise: th.Tensor
+
+
+class ScoreCoefficients(NamedTuple):
+    """Coefficients of score * grad log p_t(x) = velocity * v_t(x) - point * x."""
+
+    score: th.Tensor
+    velocity: th.Tensor
+    point: th.Tensor
+
+
+class Path(ABC):
+    """How x_t goes from a latent at t = 0 to an end point at t = ``end_time``."""
+
+    end_time: float = 1.0
+    stochastic: bool = False
+
+    @abstractmethod
+    def coefficients(self, times: th.Tensor) -> PathCoefficients:
+        """Coefficients of x_t at each time."""
+
+    @abstractmethod
+    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+        """Coefficients of dx_t/dt at each time."""
+
+    @abstractmethod
+    def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
+        """Coefficients of the relation between score and velocity at each time."""
+
+    def interpolate(
+        self,
+        latents: th.Tensor,
+        endpoints: th.Tensor,
+        times: th.Tensor,
+        noise: th.Tensor | None = None,
+    ) -> th.Tensor:
+        """Points x_t on the path.
+
+        :param latents: z, shape (..., dim).
+        :param endpoints: phi, shape (..., dim).
+        :param times: t, shape (...), which broadcasts with the leading shape of the others.
+        :param noise: h ~ N(0, I), for stochastic paths; drawn if not given. Others ignore it.
+        :return: x_t, shape (..., dim).
+        """
+        return self._combine(self.coefficients(times), latents, endpoints, noise)
+
+    def derivative(
+        self,
+        latents: th.Tensor,
+        endpoints: th.Tensor,
+        times: th.Tensor,
+        noise: th.Tensor | None = None,
+    ) -> th.Tensor:
+        """Velocity dx_t/dt of the points on the path, the target of flow matching.
+
+        Takes and returns the shapes of :meth:`interpolate`.
+        """
+        return self._combine(self.derivative_coefficients(times), latents, endpoints, noise)
+
+    def brownian_residual(
+        self,
+        velocity: th.Tensor,
+        old_velocity: th.Tensor,
+        points: th.Tensor,
+        times: th.Tensor,
+    ) -> th.Tensor:
+        """How far a velocity is from minus the score of the reference flow (paper, eta_t).
+
+        eta = c(t) (v + grad log p_t), with the score taken from the reference velocity:
+        eta = c(t) v - (b(t) x_t - a(t) v_old),    c score = a v_old - b x_t
+
+        >>> t, x, v = th.tensor([0.25]), th.tensor([[2.0]]), th.tensor([[4.0]])
+        >>> Rectified().brownian_residual(v, v, x, t).item()  # 0.75 * 4 - (2 - 0.25 * 4)
+        2.0
+
+        :param velocity: v, shape (..., dim).
+        :param old_velocity: v_old, the reference velocity at the same points, shape (..., dim).
+        :param points: x_t, shape (..., dim).
+        :param times: t, shape (...).
+        :return: eta, shape (..., dim).
+        """
+        score, slope, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))
+        return score * velocity - (point * points - slope * old_velocity)
+
+    def _combine(
+        self,
+        coefficients: PathCoefficients,
+        latents: th.Tensor,
+        endpoints: th.Tensor,
+        noise: th.Tensor | None,
+    ) -> th.Tensor:
+        latent, endpoint, spread = (c.unsqueeze(-1) for c in coefficients)
+        points = latent * latents + endpoint * endpoints
+        if not self.stochastic:
+            return points
+        return points + spread * (th.randn_like(points) if noise is None else noise)
+
+
+class Rectified(Path):
+    """The straight path of rectified flow.
+
+    x_t = (1 - t) z + t phi,    (1 - t) grad log p_t = t v_t - x
+    """
+
+    def coefficients(self, times: th.Tensor) -> PathCoefficients:
+        return PathCoefficients(1 - times, times, th.zeros_like(times))
+
+    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+        ones = th.ones_like(times)
+        return PathCoefficients(-ones, ones, th.zeros_like(times))
+
+    def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
+        return ScoreCoefficients(1 - times, times, th.ones_like(times))
+
+
+class StochasticInterpolant(Path):
+    """A straight path with noise around its middle.
+
+    x_t = (1 - t) z + t phi + sqrt(2 t (1 - t)) h,
+    (2 (t - 1/2)^2 + 1/2) grad log p_t ~ t v_t - x: an approximation (paper, appendix on the
+    relation between score and velocity for stochastic interpolants).
+    """
+
+    stochastic = True
+
+    def coefficients(self, times: th.Tensor) -> PathCoefficients:
+        return PathCoefficients(1 - times, times, (2 * times * (1 - times)).sqrt())
+
+    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+        """Coefficients of dx_t/dt; the noise's is infinite at both end points."""
+        ones = th.ones_like(times)
+        return PathCoefficients(-ones, ones, (1 - 2 * times) / (2 * times * (1 - times)).sqrt())
+
+    def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
+        return ScoreCoefficients(2 * (times - 0.5) ** 2 + 0.5, times, th.ones_like(times))
+
+
+class TrigFlow(Path):
+    """The path along a quarter of a circle.
+
+    x_t = cos(t) z + sin(t) phi,    cos(t) grad log p_t = sin(t) v_t - cos(t) x,    0 <= t <= pi/2
+    """
+
+    end_time = math.pi / 2
+
+    def coefficients(self, times: th.Tensor) -> PathCoefficients:
+        return PathCoefficients(times.cos(), times.sin(), th.zeros_like(times))
+
+    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+        return PathCoefficients(-times.sin(), times.cos(), th.zeros_like(times))
+
+    def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
+        return ScoreCoefficients(times.cos(), times.sin(), times.cos())
+
+
+PATHS: dict[str, type[Path]] = {
+    "rectified": Rectified,
+    "stochastic": StochasticInterpolant,
+    "trigflow": TrigFlow,
+}

@@ -1,0 +1,161 @@
+"""Fixed-step solvers for the flow's ordinary differential equation dx/dt = v(x, t).
+
+The grid of a fixed-step solver is part of the method: training draws its times from it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Protocol
+
+import torch as th
+
+from sb3_policyflow.flows.choices import choose
+
+Velocity = Callable[[th.Tensor, th.Tensor], th.Tensor]
+"""``velocity(points, time)``: points (..., dim), time a tensor without dimensions."""
+
+
+class Solver(Protocol):
+    """A rule that advances points along a velocity field in equal steps."""
+
+    @property
+    def order(self) -> int:
+        """p: halving the step divides the error at the end by 2^p."""
+
+    @property
+    def evaluations(self) -> int:
+        """Velocity evaluations in each step."""
+
+    @property
+    def subdivisions(self) -> int:
+        """Parts into which the evaluation times divide a step."""
+
+    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+        """Carry ``points`` from the first to the last of ``times``."""
+
+
+@dataclass(frozen=True)
+class RungeKutta:
+    """An explicit Runge-Kutta method, given by its Butcher tableau (nodes c, matrix A, weights b).
+
+    k_i = v(x + h sum_j A_ij k_j, t + c_i h),    x(t + h) = x + h sum_i b_i k_i
+    """
+
+    order: int
+    nodes: tuple[float, ...]
+    matrix: tuple[tuple[float, ...], ...]
+    weights: tuple[float, ...]
+
+    @property
+    def evaluations(self) -> int:
+        """Velocity evaluations in each step."""
+        return len(self.nodes)
+
+    @property
+    def subdivisions(self) -> int:
+        """2 if the velocity is also evaluated in the middle of a step, 1 otherwise."""
+        return 2 if 0.5 in self.nodes else 1
+
+    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+        """Carry ``points`` from the first to the last of ``times``, ``subdivisions`` to a step."""
+        n_parts = self.subdivisions
+        for start in range(0, len(times) - 1, n_parts):
+            points = self._step(velocity, points, times[start : start + n_parts + 1])
+        return points
+
+    def _step(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+        step = times[-1] - times[0]
+        slopes: list[th.Tensor] = []
+        for node, row in zip(self.nodes, self.matrix, strict=True):
+            time = times[round(node * self.subdivisions)]
+            slopes.append(velocity(points + step * _weighted_sum(row, slopes), time))
+        return points + step * _weighted_sum(self.weights, slopes)
+
+
+@dataclass(frozen=True)
+class AdamsBashforth2:
+    """The two-step Adams-Bashforth method: order two for one evaluation a step.
+
+    x(t + h) = x + h (3/2 v(x_t, t) - 1/2 v(x_{t-h}, t - h)),    with one Euler step to start.
+    """
+
+    order: int = 2
+    evaluations: int = 1
+    subdivisions: int = 1
+
+    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+        """Carry ``points`` from the first to the last of ``times``."""
+        previous: th.Tensor | None = None
+        for time, next_time in pairwise(times):
+            slope = velocity(points, time)
+            change = slope if previous is None else 1.5 * slope - 0.5 * previous
+            points = points + (next_time - time) * change
+            previous = slope
+        return points
+
+
+def _weighted_sum(weights: tuple[float, ...], slopes: list[th.Tensor]) -> th.Tensor | float:
+    """Sum of weight times slope, over the weights that are not zero."""
+    terms = [w * k for w, k in zip(weights, slopes, strict=True) if w != 0.0]
+    return sum(terms[1:], start=terms[0]) if terms else 0.0
+
+
+SOLVERS: dict[str, Solver] = {
+    "euler": RungeKutta(1, nodes=(0.0,), matrix=((),), weights=(1.0,)),
+    "midpoint": RungeKutta(2, nodes=(0.0, 0.5), matrix=((), (0.5,)), weights=(0.0, 1.0)),
+    "heun": RungeKutta(2, nodes=(0.0, 1.0), matrix=((), (1.0,)), weights=(0.5, 0.5)),
+    "rk4": RungeKutta(
+        4,
+        nodes=(0.0, 0.5, 0.5, 1.0),
+        matrix=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+        weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    ),
+    "ab2": AdamsBashforth2(),
+}
+
+
+def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
+    """Every time at which a solver looks, end points included (paper: the discrete time grid).
+
+    >>> solver_times("midpoint", 2).tolist()
+    [0.0, 0.25, 0.5, 0.75, 1.0]
+
+    :param solver: Name of the solver.
+    :param n_steps: Number of equal steps, at least 1.
+    :param end_time: Where the integration ends.
+    :return: Times in increasing order, float64, shape (n_steps * subdivisions + 1,).
+    :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
+    """
+    if n_steps < 1:
+        raise ValueError(f"A flow needs at least one solver step, got n_flow_steps={n_steps}.")
+    n_parts = choose("solver", solver, SOLVERS).subdivisions * n_steps
+    return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64)
+
+
+def integrate(
+    velocity: Velocity,
+    latents: th.Tensor,
+    *,
+    n_steps: int = 12,
+    solver: str = "midpoint",
+    end_time: float = 1.0,
+) -> th.Tensor:
+    """Carry latents along the flow to its end points (paper, flow ODE).
+
+    phi = z + int_0^T v(x_t, t) dt,    x_0 = z
+
+    >>> z = th.ones(1, 1, dtype=th.float64)
+    >>> round(integrate(lambda x, t: x, z, solver="rk4").item(), 4)
+    2.7183
+
+    :param velocity: The field ``velocity(points, time)``.
+    :param latents: z, where the flow starts, shape (..., dim).
+    :param n_steps: Number of equal steps, at least 1.
+    :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
+    :param end_time: T, where the flow ends.
+    :return: phi, the end points, of the shape of ``latents``.
+    :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
+    """
+    times = solver_times(solver, n_steps, end_time).to(latents)
+    return SOLVERS[solver].solve(velocity, latents, times)

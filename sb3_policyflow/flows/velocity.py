@@ -1,0 +1,150 @@
+"""The velocity field v(x, t, s) of a flow policy (paper, Model Architecture)."""
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import torch as th
+from torch import nn
+
+from sb3_policyflow.flows.choices import choose
+
+
+class FourierTimeEmbedding(nn.Module):
+    """An MLP over cosines and sines of fixed frequencies.
+
+    t_emb = MLP([cos(2 pi f_i t), sin(2 pi f_i t)])    (paper, Model Architecture)
+
+    >>> FourierTimeEmbedding(8)(th.rand(5, 3)).shape
+    torch.Size([5, 3, 8])
+
+    :param embedding_dim: Size of the embedding.
+    :param frequencies: The frequencies f_i in turns per unit of time, or how many to draw from
+        N(0, ``frequency_scale``^2); half the embedding's size if not given.
+    :param frequency_scale: Standard deviation of the frequencies that are drawn.
+    :param activation_fn: Activation of the MLP.
+    """
+
+    frequencies: th.Tensor
+
+    def __init__(
+        self,
+        embedding_dim: int,
+        frequencies: int | Sequence[float] | None = None,
+        frequency_scale: float = 1.0,
+        activation_fn: type[nn.Module] = nn.Mish,
+    ) -> None:
+        super().__init__()
+        if frequencies is None:
+            frequencies = max(embedding_dim // 2, 1)
+        if isinstance(frequencies, int):
+            values = frequency_scale * th.randn(frequencies)
+        else:
+            values = th.as_tensor(frequencies, dtype=th.get_default_dtype())
+        self.register_buffer("frequencies", values)
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * len(values), embedding_dim),
+            activation_fn(),
+            nn.Linear(embedding_dim, embedding_dim),
+        )
+
+    def forward(self, times: th.Tensor) -> th.Tensor:
+        """Embed times of shape (...) into shape (..., embedding_dim)."""
+        phases = 2 * math.pi * times.unsqueeze(-1) * self.frequencies
+        embedding: th.Tensor = self.mlp(th.cat([phases.cos(), phases.sin()], dim=-1))
+        return embedding
+
+
+class VelocityField(nn.Module):
+    """A velocity conditioned on time and observation features.
+
+    v(x, t, s) = MLP([x, t_emb(t) + W s])    (paper, Model Architecture)
+
+    >>> field = VelocityField(2, 3, net_arch=[16])
+    >>> field(th.randn(7, 2), th.rand(7), th.randn(7, 3)).shape
+    torch.Size([7, 2])
+
+    :param dim: Dimensions of the points, those of the action.
+    :param features_dim: Dimensions of the observation's features.
+    :param net_arch: Hidden layers of the MLP.
+    :param activation_fn: Activation of both MLPs.
+    :param embedding_dim: Size of the time and observation embeddings.
+    :param frequencies: See :class:`FourierTimeEmbedding`.
+    :param frequency_scale: See :class:`FourierTimeEmbedding`.
+    :param initialisation: "glorot", "glorot_zero_output" or "zero" (paper, sensitivity to network
+        initialisation). With "zero" only the output's bias ever learns if the activation of 0 is 0.
+    :raises ValueError: If the initialisation is unknown or the embedding is empty.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        features_dim: int,
+        net_arch: Sequence[int] = (64, 64),
+        activation_fn: type[nn.Module] = nn.Mish,
+        embedding_dim: int = 64,
+        frequencies: int | Sequence[float] | None = None,
+        frequency_scale: float = 1.0,
+        initialisation: str = "glorot_zero_output",
+    ) -> None:
+        super().__init__()
+        if embedding_dim < 1:
+            raise ValueError(f"embedding_dim must be at least 1, got {embedding_dim}.")
+        initialise = choose("initialisation", initialisation, INITIALISATIONS)
+        self.time_embedding = FourierTimeEmbedding(
+            embedding_dim, frequencies, frequency_scale, activation_fn
+        )
+        self.observation_embedding = nn.Linear(features_dim, embedding_dim)
+        self.hidden = _hidden_layers(dim + embedding_dim, net_arch, activation_fn)
+        self.output = nn.Linear([dim + embedding_dim, *net_arch][-1], dim)
+        initialise(self)
+
+    def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Velocity at points, times and features, whose leading shapes broadcast.
+
+        :param points: x, shape (..., dim).
+        :param times: t, shape (...).
+        :param features: s, shape (..., features_dim).
+        :return: v, shape (..., dim).
+        """
+        embedding = self.time_embedding(times) + self.observation_embedding(features)
+        embedding = embedding.expand(*points.shape[:-1], embedding.shape[-1])
+        velocity: th.Tensor = self.output(self.hidden(th.cat([points, embedding], dim=-1)))
+        return velocity
+
+
+def _hidden_layers(
+    input_dim: int, net_arch: Sequence[int], activation_fn: type[nn.Module]
+) -> nn.Sequential:
+    sizes = [input_dim, *net_arch]
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(sizes):
+        layers += [nn.Linear(n_in, n_out), activation_fn()]
+    return nn.Sequential(*layers)
+
+
+def _glorot(field: VelocityField) -> None:
+    """Glorot weights and zero biases (paper: GI)."""
+    for layer in field.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_normal_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+
+def _glorot_zero_output(field: VelocityField) -> None:
+    """Glorot weights and an output layer of zeros (paper: GI+ZOL)."""
+    _glorot(field)
+    nn.init.zeros_(field.output.weight)
+
+
+def _zero(field: VelocityField) -> None:
+    """Zero everywhere (paper: ZI)."""
+    for parameter in field.parameters():
+        nn.init.zeros_(parameter)
+
+
+INITIALISATIONS: dict[str, Callable[[VelocityField], None]] = {
+    "glorot": _glorot,
+    "glorot_zero_output": _glorot_zero_output,
+    "zero": _zero,
+}
