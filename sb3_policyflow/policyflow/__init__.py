@@ -1,0 +1,9 @@
+from sb3_policyflow.policyflow.policies import (
+    CnnFlowPolicy,
+    FlowPolicy,
+    MlpFlowPolicy,
+    MultiInputFlowPolicy,
+)
+from sb3_policyflow.policyflow.policyflow import PolicyFlow
+
+__all__ = ["CnnFlowPolicy", "FlowPolicy", "MlpFlowPolicy", "MultiInputFlowPolicy", "PolicyFlow"]

@@ -1,0 +1,88 @@
+"""Checks of what the user asks for, made before any work is done."""
+
+import warnings
+from collections.abc import Collection
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from sb3_policyflow.common.buffers import (
+    DictFlowRolloutBuffer,
+    FlowRolloutBuffer,
+    RecordBufferMixin,
+)
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Refuse a value that is not among the choices.
+
+    :raises ValueError: With the choices.
+    """
+    if value not in choices:
+        known = ", ".join(repr(choice) for choice in choices)
+        raise ValueError(f"{name} must be one of {known}, got {value!r}.")
+
+
+def check_at_least(name: str, value: float, lowest: float) -> None:
+    """Refuse a number that is too small (or none at all).
+
+    :raises ValueError: With the lowest value that is allowed.
+    """
+    if not isinstance(value, (int, float)) or not value >= lowest:
+        raise ValueError(f"{name} must be at least {lowest}, got {value!r}.")
+
+
+def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any]) -> None:
+    """Refuse a policy of another kind.
+
+    :raises ValueError: If ``policy_class`` is not derived from ``base``.
+    """
+    if not (isinstance(policy_class, type) and issubclass(policy_class, base)):
+        raise ValueError(
+            f"{algorithm} trains policies derived from {base.__name__}, not "
+            f"{getattr(policy_class, '__name__', policy_class)}: use 'MlpFlowPolicy', "
+            "'CnnFlowPolicy' or 'MultiInputFlowPolicy', or derive your own from "
+            f"{base.__module__}.{base.__name__}."
+        )
+
+
+def choose_buffer_class(
+    algorithm: str, given: type[RolloutBuffer] | None, observation_space: spaces.Space[Any]
+) -> type[RecordBufferMixin]:
+    """The buffer for an observation space, or the user's own if it keeps a record.
+
+    :raises ValueError: If the user's own keeps none.
+    """
+    is_dict = isinstance(observation_space, spaces.Dict)
+    default = DictFlowRolloutBuffer if is_dict else FlowRolloutBuffer
+    if given is None:
+        return default
+    if not issubclass(given, RecordBufferMixin):
+        raise ValueError(
+            f"{algorithm} needs a rollout buffer that keeps how each action was made, which "
+            f"{given.__name__} does not: leave out rollout_buffer_class, or derive yours from "
+            f"{default.__module__}.{default.__name__}."
+        )
+    return given
+
+
+def check_batches(batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool) -> None:
+    """Refuse sizes that SB3's PPO refuses, and warn of those it warns of.
+
+    :raises ValueError: If advantages would be normalised over one sample.
+    """
+    buffer_size = n_steps * n_envs
+    check_at_least("batch_size", batch_size, 2 if normalize_advantage else 1)
+    if normalize_advantage and buffer_size < 2:
+        raise ValueError(
+            "Advantages cannot be normalised over one sample: n_steps * n_envs must be greater "
+            f"than 1, got n_steps={n_steps} and n_envs={n_envs}."
+        )
+    if buffer_size % batch_size > 0:
+        warnings.warn(
+            f"batch_size={batch_size} does not divide n_steps * n_envs = {n_steps} * {n_envs} = "
+            f"{buffer_size}: the last minibatch of each epoch will have "
+            f"{buffer_size % batch_size} samples. Use a factor of {buffer_size}.",
+            stacklevel=4,
+        )

@@ -1,0 +1,239 @@
+"""What the policies of all flow algorithms share: networks, values and the way of an action."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    FlattenExtractor,
+    MlpExtractor,
+    NatureCNN,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_policyflow.flows import VelocityField
+
+OWN_PARAMETERS = (
+    "share_features_extractor",
+    "embedding_dim",
+    "frequencies",
+    "frequency_scale",
+    "initialisation",
+    "log_std_bounds",
+)
+"""Constructor arguments that SB3's ``save`` of a policy does not know of."""
+
+NetArch = list[int] | dict[str, list[int]]
+
+
+class FlowActorCriticPolicy(ActorCriticPolicy):
+    """An actor-critic policy whose actor is a velocity field.
+
+    ``forward`` returns actions, values and a record: a NamedTuple of tensors that says how the
+    actions were made. Siblings differ in :meth:`sample_actions`.
+
+    :param observation_space: Observation space.
+    :param action_space: Action space, a Box.
+    :param lr_schedule: Learning rate schedule.
+    :param net_arch: Hidden layers of the velocity field (``pi``) and of the critic (``vf``).
+        Default: [64, 64] for both, and none for the critic behind a ``NatureCNN``.
+    :param activation_fn: Activation of both networks.
+    :param ortho_init: Whether to initialise features extractor and critic orthogonally, as SB3
+        does. The velocity field has its own ``initialisation``.
+    :param use_sde: Not supported.
+    :param log_std_init: Initial log standard deviation of the Gaussian noise.
+    :param features_extractor_class: Features extractor.
+    :param features_extractor_kwargs: Keyword arguments of the features extractor.
+    :param share_features_extractor: Whether actor and critic share the features extractor.
+    :param normalize_images: Whether to divide images by 255.
+    :param optimizer_class: Optimizer.
+    :param optimizer_kwargs: Keyword arguments of the optimizer, except the learning rate.
+    :param embedding_dim: Size of the time and observation embeddings.
+    :param frequencies: Frequencies of the time embedding, or how many to draw.
+    :param frequency_scale: Standard deviation of the frequencies that are drawn.
+    :param initialisation: "glorot", "glorot_zero_output" or "zero".
+    :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
+    :raises ValueError: If an option is not supported.
+    """
+
+    mlp_extractor: MlpExtractor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        net_arch: NetArch | None = None,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        ortho_init: bool = True,
+        use_sde: bool = False,
+        log_std_init: float = 0.0,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = True,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        embedding_dim: int = 64,
+        frequencies: int | Sequence[float] | None = None,
+        frequency_scale: float = 1.0,
+        initialisation: str = "glorot_zero_output",
+        log_std_bounds: tuple[float, float] | None = None,
+    ) -> None:
+        check_flow_spaces(action_space, use_sde)
+        self.embedding_dim = embedding_dim
+        self.frequencies = frequencies
+        self.frequency_scale = frequency_scale
+        self.initialisation = initialisation
+        self.log_std_bounds = log_std_bounds
+        if net_arch is None and features_extractor_class is NatureCNN:
+            # SB3 puts no layer behind its CNN, but a velocity without one is linear in the action.
+            net_arch = {"pi": [64, 64], "vf": []}
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            ortho_init=ortho_init,
+            log_std_init=log_std_init,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            share_features_extractor=share_features_extractor,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for sde_option in ("use_sde", "full_std", "use_expln", "squash_output"):
+            del data[sde_option]
+        return {**data, **{name: getattr(self, name) for name in OWN_PARAMETERS}}
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action dimensions, whatever the shape of the Box."""
+        return get_action_dim(self.action_space)
+
+    def _layers(self, head: str) -> list[int]:
+        """Hidden layers of the actor ("pi") or the critic ("vf")."""
+        arch = self.net_arch
+        return list(arch.get(head, [])) if isinstance(arch, dict) else list(arch)
+
+    def _build_mlp_extractor(self) -> None:
+        """Build the critic's hidden layers; the actor's belong to the velocity field."""
+        self.mlp_extractor = MlpExtractor(
+            self.features_dim,
+            net_arch={"pi": [], "vf": self._layers("vf")},
+            activation_fn=self.activation_fn,
+            device=self.device,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        del self.action_net
+        self.velocity = VelocityField(
+            self.action_dim,
+            self.features_dim,
+            net_arch=self._layers("pi"),
+            activation_fn=self.activation_fn,
+            embedding_dim=self.embedding_dim,
+            frequencies=self.frequencies,
+            frequency_scale=self.frequency_scale,
+            initialisation=self.initialisation,
+        )
+        # SB3 made one for the parameters of a Gaussian actor.
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]  # every torch optimizer takes one
+            **self.optimizer_kwargs,
+        )
+
+    @property
+    def noise_log_std(self) -> th.Tensor:
+        """Logarithm of sigma of the Gaussian noise within its bounds, shape (action_dim,)."""
+        if self.log_std_bounds is None:
+            return self.log_std
+        return self.log_std.clamp(*self.log_std_bounds)
+
+    def actor_features(self, obs: PyTorchObs) -> th.Tensor:
+        """Features for the actor, shape (n, features_dim)."""
+        # BasePolicy's extract_features serves one extractor, ActorCriticPolicy's always both.
+        return super(ActorCriticPolicy, self).extract_features(obs, self.pi_features_extractor)
+
+    def actor_critic_features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """Features for actor and critic, extracted once where they are shared."""
+        features = self.extract_features(obs)
+        return features if isinstance(features, tuple) else (features, features)
+
+    def values(self, features: th.Tensor) -> th.Tensor:
+        """Estimated values of states with these features, shape (n, 1)."""
+        values: th.Tensor = self.value_net(self.mlp_extractor.forward_critic(features))
+        return values
+
+    @abstractmethod
+    def sample_actions(
+        self, features: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, Any]:
+        """Draw actions.
+
+        :param features: The actor's features, shape (n, features_dim).
+        :param deterministic: Whether to draw nothing at random.
+        :return: Actions, shape (n, action_dim), and the record of how they were made.
+        """
+
+    def forward(
+        self, obs: PyTorchObs, deterministic: bool = False
+    ) -> tuple[th.Tensor, th.Tensor, Any]:
+        """Act and estimate values.
+
+        :param obs: Observations of n environments.
+        :param deterministic: Whether to draw nothing at random.
+        :return: Actions (n, *action shape), values (n, 1), and the record of the actions.
+        """
+        actor_features, critic_features = self.actor_critic_features(obs)
+        actions, record = self.sample_actions(actor_features, deterministic)
+        return self._shaped(actions), self.values(critic_features), record
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        actions, _ = self.sample_actions(self.actor_features(observation), deterministic)
+        return self._shaped(actions)
+
+    def _shaped(self, actions: th.Tensor) -> th.Tensor:
+        assert self.action_space.shape is not None
+        return actions.reshape(-1, *self.action_space.shape)
+
+    def evaluate_actions(
+        self,
+        obs: PyTorchObs,  # noqa: ARG002
+        actions: th.Tensor,  # noqa: ARG002
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Refuse: the likelihood of an action under a flow policy has no closed form."""
+        raise TypeError(
+            f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
+            "flow algorithms of sb3_policyflow, which need none."
+        )
+
+
+def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
+    """Refuse what a flow policy cannot do.
+
+    :raises ValueError: If the actions are not continuous, or gSDE is asked for.
+    """
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(
+            f"Flow policies need continuous actions (a Box), but the action space is "
+            f"{action_space}: use PPO of stable_baselines3 for it."
+        )
+    if use_sde:
+        raise ValueError(
+            "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
+            "leave it out, and set the noise with policy_kwargs=dict(log_std_init=...)."
+        )
