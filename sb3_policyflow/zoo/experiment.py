@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import optuna
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -69,8 +70,6 @@ def prune_if_diverged(objective: Callable[..., float]) -> Callable[..., float]:
         try:
             return objective(trial)
         except ArithmeticError as error:
-            from optuna.exceptions import TrialPruned
-
-            raise TrialPruned(str(error)) from error
+            raise optuna.TrialPruned(str(error)) from error
 
     return prune

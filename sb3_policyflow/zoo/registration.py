@@ -4,8 +4,9 @@ They run when the module has been executed (see ``sb3_policyflow_startup``), and
 """
 
 import functools
-import importlib.util
+import importlib
 import inspect
+import warnings
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -50,9 +51,17 @@ def _add_algorithms(utils: ModuleType) -> None:
     """Let ``--algo`` and ``--env`` know the algorithms and environments."""
     for name, registration in ALGORITHMS.items():
         utils.ALGOS.setdefault(name, registration.algorithm)
-    # Its environments exist once it is imported, as those of packages that rl_zoo3 knows of.
-    if importlib.util.find_spec("gymnasium_robotics") is not None:
+    _import_robotics()
+
+
+def _import_robotics() -> None:
+    """Register gymnasium_robotics' environments, as rl_zoo3 does with the packages it knows of."""
+    try:
         importlib.import_module("gymnasium_robotics")
+    except ModuleNotFoundError as error:
+        if error.name == "gymnasium_robotics":
+            return
+        warnings.warn(f"gymnasium_robotics' environments are missing: {error}", stacklevel=2)
 
 
 def _add_search_spaces(hyperparams_opt: ModuleType) -> None:

@@ -4,12 +4,10 @@ A study keeps only the raw values that a trial drew. ``sample_...`` draws them a
 hyperparameters; ``convert_flow_params`` makes the same hyperparameters of the raw values again.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from optuna import Trial
 from torch import nn
-
-if TYPE_CHECKING:
-    from optuna import Trial
 
 NET_ARCHS = {
     "tiny": [64],
@@ -27,7 +25,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 
 
 def sample_policyflow_params(
-    trial: "Trial",
+    trial: Trial,
     n_actions: int,  # noqa: ARG001
     n_envs: int,
     additional_args: dict[str, Any],  # noqa: ARG001
@@ -51,7 +49,7 @@ def sample_policyflow_params(
     return finish_sample(trial, params)
 
 
-def suggest_on_policy(trial: "Trial", n_envs: int) -> dict[str, Any]:
+def suggest_on_policy(trial: Trial, n_envs: int) -> dict[str, Any]:
     """Draw what every on-policy algorithm has, for rollouts that grow with ``n_envs``.
 
     The rollout has between 1024 and 32768 transitions, and at least 8 steps of each environment.
@@ -73,7 +71,7 @@ def suggest_on_policy(trial: "Trial", n_envs: int) -> dict[str, Any]:
     }
 
 
-def suggest_network(trial: "Trial") -> dict[str, Any]:
+def suggest_network(trial: Trial) -> dict[str, Any]:
     """Draw the networks and the initial noise."""
     return {
         "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
@@ -83,7 +81,7 @@ def suggest_network(trial: "Trial") -> dict[str, Any]:
     }
 
 
-def finish_sample(trial: "Trial", params: dict[str, Any]) -> dict[str, Any]:
+def finish_sample(trial: Trial, params: dict[str, Any]) -> dict[str, Any]:
     """Convert the raw values and show in the study what they stand for."""
     hyperparams = convert_flow_params(params)
     # rl_zoo3 has made the environments already, and hands the rest to the constructor.
