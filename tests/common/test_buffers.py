@@ -89,11 +89,4 @@ def test_log_probabilities_in_place_of_a_record_are_refused() -> None:
     buffer = FlowRolloutBuffer(N_STEPS, VECTOR, ACTIONS, n_envs=N_ENVS)
     step = (observations(VECTOR), np.zeros((3, 2)), np.zeros(3), np.zeros(3))
     with pytest.raises(TypeError, match="use SB3's RolloutBuffer"):
-        buffer.add(
-            observations(VECTOR),
-            np.zeros((3, 2)),
-            np.zeros(3),
-            np.zeros(3),
-            th.zeros(3),
-            th.zeros(3),
-        )
+        buffer.add(*step, th.zeros(3), th.zeros(3))
