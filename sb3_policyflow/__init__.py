@@ -1,13 +1,13 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
-import sb3_policyflow_startup as _startup
-from sb3_policyflow import envs as _envs
+import sb3_policyflow_startup
+from sb3_policyflow import envs
 from sb3_policyflow.policyflow import PolicyFlow
 
 __version__ = "0.1.0"
 
 __all__ = ["PolicyFlow", "__version__"]
 
-_envs.register()
-# For interpreters that read no .pth files; elsewhere it has been done at startup.
-_startup.install()
+envs.register()
+# For interpreters that read no .pth files; others have done it at startup.
+sb3_policyflow_startup.install()

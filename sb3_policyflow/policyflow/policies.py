@@ -31,8 +31,8 @@ class FlowPolicy(FlowActorCriticPolicy):
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
 
-    :param path: "rectified", "stochastic" or "trigflow": the interpolation path of the update,
-        whose ``end_time`` T is where the flow ends.
+    :param path: "rectified", "stochastic", "stochastic_exact" or "trigflow": the interpolation
+        path of the update, whose ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
     """
