@@ -313,9 +313,7 @@ def test_callbacks_and_logs_on_disk(tmp_path: Path) -> None:
     model.learn(
         800,
         callback=[
-            EvalCallback(
-                make_vec_env("Pendulum-v1"), eval_freq=200, best_model_save_path=str(tmp_path)
-            ),
+            EvalCallback(evaluation, eval_freq=200, best_model_save_path=str(tmp_path)),
             CheckpointCallback(save_freq=200, save_path=str(tmp_path), save_vecnormalize=True),
         ],
         log_interval=1,
