@@ -2,7 +2,13 @@
 
 from sb3_policyflow.flows.paths import PATHS, Path, Rectified, StochasticInterpolant, TrigFlow
 from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
-from sb3_policyflow.flows.times import TIME_SAMPLERS, GridTimes, TimeSampler, UniformTimes
+from sb3_policyflow.flows.times import (
+    TIME_SAMPLERS,
+    GridTimes,
+    StartTimes,
+    TimeSampler,
+    UniformTimes,
+)
 from sb3_policyflow.flows.velocity import INITIALISATIONS, FourierTimeEmbedding, VelocityField
 
 __all__ = [
@@ -15,6 +21,7 @@ __all__ = [
     "Path",
     "Rectified",
     "Solver",
+    "StartTimes",
     "StochasticInterpolant",
     "TimeSampler",
     "TrigFlow",
