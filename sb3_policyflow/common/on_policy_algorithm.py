@@ -8,7 +8,7 @@ from stable_baselines3.common.utils import explained_variance
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from sb3_policyflow.common.arguments import FlowAlgorithmArguments
-from sb3_policyflow.common.losses import clipped_surrogate
+from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.metrics import UpdateMetrics
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 
@@ -19,6 +19,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     For arguments see :class:`~sb3_policyflow.common.arguments.FlowAlgorithmArguments`.
     """
 
+    trust_region: str = "ppo"
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
 
@@ -120,9 +121,9 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         return batch.advantages
 
     def _surrogate(self, log_ratio: th.Tensor, advantages: th.Tensor) -> th.Tensor:
-        """The clipped objective, of the shape (n, ...) of ``log_ratio``."""
+        """The objective within the trust region, of the shape (n, ...) of ``log_ratio``."""
         advantages = advantages.reshape(-1, *[1] * (log_ratio.dim() - 1))
-        return clipped_surrogate(log_ratio, advantages, self._clip_range_now())
+        return SURROGATES[self.trust_region](log_ratio, advantages, self._clip_range_now())
 
     def _clip_range_now(self) -> float | th.Tensor:
         """Epsilon at the present progress, one number or of a shape that fits the log ratio."""
