@@ -1,5 +1,6 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
+import sb3_policyflow_startup
 from sb3_policyflow import envs
 from sb3_policyflow.policyflow import PolicyFlow
 
@@ -8,3 +9,5 @@ __version__ = "0.1.0"
 __all__ = ["PolicyFlow", "__version__"]
 
 envs.register()
+# For interpreters that read no .pth files; others have done it at startup.
+sb3_policyflow_startup.install()
