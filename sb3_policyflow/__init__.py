@@ -1,7 +1,9 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
+from sb3_policyflow.dppo import DPPO
+from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
 __version__ = "0.1.0"
 
-__all__ = ["PolicyFlow", "__version__"]
+__all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]

@@ -228,7 +228,8 @@ class FPO(SampledEntropyMixin):
         times, noises, _ = probes
         actions = samples.actions.unsqueeze(1)
         points = self.policy.path.interpolate(noises, actions, times)
-        error = self.policy.velocity(points, times, features.unsqueeze(1)) - (actions - noises)
+        velocity: th.Tensor = self.policy.velocity(points, times, features.unsqueeze(1))
+        error = velocity - (actions - noises)
         if self.loss_target == "epsilon":
             error = times.unsqueeze(-1) * error
         squares = error.square()
