@@ -1,5 +1,6 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
+from sb3_policyflow import envs
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
@@ -7,3 +8,5 @@ from sb3_policyflow.policyflow import PolicyFlow
 __version__ = "0.1.0"
 
 __all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]
+
+envs.register()

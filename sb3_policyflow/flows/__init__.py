@@ -1,6 +1,13 @@
 """Continuous normalizing flows for policies, in plain torch: fields, paths, solvers and times."""
 
-from sb3_policyflow.flows.paths import PATHS, Path, Rectified, StochasticInterpolant, TrigFlow
+from sb3_policyflow.flows.paths import (
+    PATHS,
+    ExactStochasticInterpolant,
+    Path,
+    Rectified,
+    StochasticInterpolant,
+    TrigFlow,
+)
 from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
 from sb3_policyflow.flows.times import (
     TIME_SAMPLERS,
@@ -16,6 +23,7 @@ __all__ = [
     "PATHS",
     "SOLVERS",
     "TIME_SAMPLERS",
+    "ExactStochasticInterpolant",
     "FourierTimeEmbedding",
     "GridTimes",
     "Path",

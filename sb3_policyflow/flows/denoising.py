@@ -52,7 +52,7 @@ class DDPM(DenoisingProcess):
     standard deviation of q(x_{k+1} | x_k, data), with eps the network's output (plus x_k).
 
     >>> [round(std, 3) for std in DDPM(4).stds.tolist()]  # the last step adds no noise
-    [0.853, 0.533, 0.287, 0.0]
+    [0.925, 0.647, 0.355, 0.0]
 
     :param n_steps: K.
     :param data_clip: The data are taken to lie in [-data_clip, data_clip].

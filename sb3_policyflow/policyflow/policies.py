@@ -29,8 +29,8 @@ class FlowPolicy(OdeFlowPolicy):
 
     :param log_std_init: Initial log standard deviation of the Gaussian noise.
     :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
-    :param path: "rectified", "stochastic" or "trigflow": the interpolation path of the update,
-        whose ``end_time`` T is where the flow ends.
+    :param path: "rectified", "stochastic", "stochastic_exact" or "trigflow": the interpolation
+        path of the update, whose ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
     :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
