@@ -32,7 +32,7 @@ def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
         ({"n_flow_steps": 0}, r"at least one solver step"),
         ({"path": "straight"}, r"Unknown path 'straight': choose one of 'rectified', 'stochastic'"),
         ({"solver": "dopri5"}, r"Unknown solver 'dopri5': choose one of 'euler', 'midpoint'"),
-        ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'uniform'"),
+        ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'starts', 'uniform'"),
         ({"n_times": 0}, r"n_times must be at least 1"),
         ({"time_average": "ratio"}, r"time_average must be one of 'objective', 'shift'"),
         ({"brownian_coef": -0.1}, r"brownian_coef must not be negative"),
