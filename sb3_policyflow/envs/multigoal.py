@@ -39,9 +39,15 @@ from sb3_policyflow.envs.point_masses import (
 )
 from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
 
-OBSERVATION_SPACE = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
-ACTION_SPACE = gym.spaces.Box(-MAX_ACTION, MAX_ACTION, (2,), np.float32)
 METADATA: Info = {"render_modes": ["rgb_array"], "render_fps": 15}
+
+
+def _spaces() -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Observation and action space; new ones for each environment, as each has its own seed."""
+    return (
+        gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),
+        gym.spaces.Box(-MAX_ACTION, MAX_ACTION, (2,), np.float32),
+    )
 
 
 class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
@@ -63,8 +69,7 @@ class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
     def __init__(
         self, render_mode: str | None = None, max_episode_steps: int = MAX_EPISODE_STEPS
     ) -> None:
-        self.observation_space = OBSERVATION_SPACE
-        self.action_space = ACTION_SPACE
+        self.observation_space, self.action_space = _spaces()
         self.render_mode = render_mode
         self.points = PointMasses(1, max_episode_steps, keep_trails=render_mode is not None)
 
@@ -124,10 +129,9 @@ class MultiGoalVectorEnv(gym.vector.VectorEnv[Observation, NDArray[np.float32], 
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.points = PointMasses(num_envs, max_episode_steps, keep_trails=render_mode is not None)
-        self.single_observation_space = OBSERVATION_SPACE
-        self.single_action_space = ACTION_SPACE
-        self.observation_space = batch_space(OBSERVATION_SPACE, num_envs)
-        self.action_space = batch_space(ACTION_SPACE, num_envs)
+        self.single_observation_space, self.single_action_space = _spaces()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None

@@ -290,6 +290,15 @@ def test_registering_imports_neither_torch_nor_mujoco():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_each_environment_seeds_its_own_spaces():
+    one, other = MultiGoalEnv(), MultiGoalEnv()
+    one.action_space.seed(0)
+    first = one.action_space.sample()
+    one.action_space.seed(0)
+    other.action_space.sample()
+    np.testing.assert_array_equal(one.action_space.sample(), first)
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_environment_checkers_pass():
     gymnasium_check_env(gym.make("MultiGoal-v0", render_mode="rgb_array").unwrapped)
