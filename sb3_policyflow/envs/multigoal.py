@@ -42,7 +42,7 @@ from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
 METADATA: Info = {"render_modes": ["rgb_array"], "render_fps": 15}
 
 
-def _spaces() -> tuple[gym.spaces.Box, gym.spaces.Box]:
+def _spaces() -> tuple[gym.Space[Observation], gym.Space[Observation]]:
     """Observation and action space; new ones for each environment, as each has its own seed."""
     return (
         gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),

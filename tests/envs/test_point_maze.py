@@ -8,12 +8,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.envs.drawing import GOAL_COLOURS, Canvas
+from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 pytest.importorskip("gymnasium_robotics")
 
@@ -161,6 +164,30 @@ def test_stock_maze_trains_from_its_dictionary_observation():
     ensure_registered(STOCK_ID)
     env = make_vec_env(STOCK_ID, n_envs=2, seed=0)
     PPO("MultiInputPolicy", env, n_steps=32, batch_size=32, n_epochs=1, device="cpu").learn(64)
+
+
+def test_vector_adapter_equals_dummy_vec_env_with_dictionary_observations():
+    ensure_registered(STOCK_ID)
+    makers = [lambda: gym.make(STOCK_ID, max_episode_steps=15)] * 2
+    ours = GymVectorVecEnv(SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP))
+    dummy = DummyVecEnv(makers)
+    for env in (ours, dummy):
+        env.seed(3)
+        env.reset()
+    for action in pushes(40):
+        one, other = ours.step([action] * 2), dummy.step(np.stack([action] * 2))
+        assert_same(one[0], other[0])
+        assert_same(dict(enumerate(one[3])), dict(enumerate(other[3])))
+    assert_same(dict(enumerate(ours.reset_infos)), dict(enumerate(dummy.reset_infos)))
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for key, value in one.items():
+        if isinstance(value, dict):
+            assert_same(value, other[key])
+        else:
+            np.testing.assert_array_equal(value, other[key])
 
 
 # Registration, in processes of their own
