@@ -2,11 +2,13 @@
 
 import sb3_policyflow_startup
 from sb3_policyflow import envs
+from sb3_policyflow.dppo import DPPO
+from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
 __version__ = "0.1.0"
 
-__all__ = ["PolicyFlow", "__version__"]
+__all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]
 
 envs.register()
 # For interpreters that read no .pth files; others have done it at startup.

@@ -9,7 +9,13 @@ from sb3_policyflow.flows.paths import (
     TrigFlow,
 )
 from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
-from sb3_policyflow.flows.times import TIME_SAMPLERS, GridTimes, TimeSampler, UniformTimes
+from sb3_policyflow.flows.times import (
+    TIME_SAMPLERS,
+    GridTimes,
+    StartTimes,
+    TimeSampler,
+    UniformTimes,
+)
 from sb3_policyflow.flows.velocity import INITIALISATIONS, FourierTimeEmbedding, VelocityField
 
 __all__ = [
@@ -23,6 +29,7 @@ __all__ = [
     "Path",
     "Rectified",
     "Solver",
+    "StartTimes",
     "StochasticInterpolant",
     "TimeSampler",
     "TrigFlow",

@@ -13,9 +13,14 @@ from typing import Any, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.zoo.experiment import extend_experiment
-from sb3_policyflow.zoo.samplers import convert_flow_params, sample_policyflow_params
+from sb3_policyflow.zoo.samplers import (
+    convert_flow_params,
+    sample_dppo_params,
+    sample_fpo_params,
+    sample_policyflow_params,
+)
 
 Hyperparams = dict[str, Any]
 
@@ -30,6 +35,8 @@ class Registration(NamedTuple):
 
 ALGORITHMS = {
     "policyflow": Registration(PolicyFlow, sample_policyflow_params, convert_flow_params),
+    "fpo": Registration(FPO, sample_fpo_params, convert_flow_params),
+    "dppo": Registration(DPPO, sample_dppo_params, convert_flow_params),
 }
 """What ``--algo`` takes; each has its ``hyperparams/NAME.yml``."""
 

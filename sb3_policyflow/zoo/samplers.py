@@ -4,6 +4,7 @@ A study keeps only the raw values that a trial drew. ``sample_...`` draws them a
 hyperparameters; ``convert_flow_params`` makes the same hyperparameters of the raw values again.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from optuna import Trial
@@ -41,15 +42,60 @@ def sample_policyflow_params(
     params = {
         **suggest_on_policy(trial, n_envs),
         **suggest_network(trial),
+        "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
         "brownian_coef": trial.suggest_float("brownian_coef", 1e-4, 0.5, log=True),
         "path": trial.suggest_categorical("path", ["rectified", "stochastic", "trigflow"]),
         "n_flow_steps": trial.suggest_categorical("n_flow_steps", [4, 8, 12]),
         "solver": trial.suggest_categorical("solver", ["midpoint", "euler", "heun", "ab2"]),
+        "log_std_init": trial.suggest_float("log_std_init", -2.5, 0.5),
     }
     return finish_sample(trial, params)
 
 
-def suggest_on_policy(trial: Trial, n_envs: int) -> dict[str, Any]:
+def sample_fpo_params(
+    trial: Trial,
+    n_actions: int,  # noqa: ARG001
+    n_envs: int,
+    additional_args: dict[str, Any],  # noqa: ARG001
+) -> dict[str, Any]:
+    """Draw hyperparameters of FPO; see :func:`sample_policyflow_params`."""
+    params = {
+        **suggest_on_policy(trial, n_envs, clip_ranges=(0.01, 0.03, 0.05, 0.1)),
+        **suggest_network(trial),
+        "n_probes": trial.suggest_categorical("n_probes", [4, 8, 16]),
+        "probe_average": trial.suggest_categorical("probe_average", ["loss", "objective"]),
+        "loss_target": trial.suggest_categorical("loss_target", ["epsilon", "velocity"]),
+        "trust_region": trial.suggest_categorical("trust_region", ["ppo", "spo", "aspo"]),
+        "difference_clamp": trial.suggest_categorical("difference_clamp", [3.0, 10.0]),
+        "n_flow_steps": trial.suggest_categorical("n_flow_steps", [5, 10, 20]),
+    }
+    return finish_sample(trial, params)
+
+
+def sample_dppo_params(
+    trial: Trial,
+    n_actions: int,  # noqa: ARG001
+    n_envs: int,
+    additional_args: dict[str, Any],  # noqa: ARG001
+) -> dict[str, Any]:
+    """Draw hyperparameters of DPPO; see :func:`sample_policyflow_params`."""
+    params = {
+        **suggest_on_policy(trial, n_envs),
+        **suggest_network(trial),
+        "process": trial.suggest_categorical("process", ["ddpm", "flow"]),
+        "n_denoising_steps": trial.suggest_categorical("n_denoising_steps", [5, 10, 20]),
+        "min_sampling_std": trial.suggest_float("min_sampling_std", 0.03, 0.3, log=True),
+        "min_log_prob_std": trial.suggest_float("min_log_prob_std", 0.03, 0.3, log=True),
+        "log_prob_reduction": trial.suggest_categorical("log_prob_reduction", ["mean", "sum"]),
+        "denoising_gamma": trial.suggest_categorical("denoising_gamma", [0.9, 0.99, 1.0]),
+        "n_critic_warmup": trial.suggest_categorical("n_critic_warmup", [0, 2, 5]),
+    }
+    return finish_sample(trial, params)
+
+
+def suggest_on_policy(
+    trial: Trial, n_envs: int, clip_ranges: Sequence[float] = (0.1, 0.2, 0.3)
+) -> dict[str, Any]:
     """Draw what every on-policy algorithm has, for rollouts that grow with ``n_envs``.
 
     The rollout has between 1024 and 32768 transitions, and at least 8 steps of each environment.
@@ -65,19 +111,17 @@ def suggest_on_policy(trial: Trial, n_envs: int) -> dict[str, Any]:
         "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True),
         "learning_rate": trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True),
         "desired_kl": trial.suggest_categorical("desired_kl", [None, 0.005, 0.01, 0.02]),
-        "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
-        "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
+        "clip_range": trial.suggest_categorical("clip_range", list(clip_ranges)),
         "max_grad_norm": trial.suggest_float("max_grad_norm", 0.3, 2.0),
     }
 
 
 def suggest_network(trial: Trial) -> dict[str, Any]:
-    """Draw the networks and the initial noise."""
+    """Draw the networks."""
     return {
         "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
         "activation_fn": trial.suggest_categorical("activation_fn", list(ACTIVATIONS)),
         "embedding_dim": trial.suggest_categorical("embedding_dim", [16, 32, 64]),
-        "log_std_init": trial.suggest_float("log_std_init", -2.5, 0.5),
     }
 
 
@@ -112,13 +156,14 @@ def convert_flow_params(params: dict[str, Any]) -> dict[str, Any]:
         2 ** hyperparams.pop("rollout_pow"),
         2 ** hyperparams.pop("n_minibatches_pow"),
     )
-    hyperparams["policy_kwargs"] = {
+    policy_kwargs = {
         "net_arch": NET_ARCHS[hyperparams.pop("net_arch")],
         "activation_fn": ACTIVATIONS[hyperparams.pop("activation_fn")],
         "embedding_dim": hyperparams.pop("embedding_dim"),
-        "log_std_init": hyperparams.pop("log_std_init"),
     }
-    return hyperparams
+    if "log_std_init" in hyperparams:
+        policy_kwargs["log_std_init"] = hyperparams.pop("log_std_init")
+    return {**hyperparams, "policy_kwargs": policy_kwargs}
 
 
 def _sizes(n_envs: int, rollout: int, n_minibatches: int) -> tuple[int, int]:
