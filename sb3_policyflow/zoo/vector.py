@@ -36,7 +36,7 @@ def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
     sample = env_fns[0]()
     sample.close()
     venv = _vectorise(sample, len(env_fns)) if isinstance(sample, Monitor) else None
-    return venv or DummyVecEnv(env_fns, **kwargs)  # type: ignore[arg-type]
+    return venv or DummyVecEnv(env_fns, **kwargs)
 
 
 def _vectorise(sample: Monitor, num_envs: int) -> VecEnv | None:
