@@ -165,6 +165,9 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             )
         self.policy.optimizer.step()
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_loss"]
+
     # The log
 
     def _log_policy(self) -> None:
