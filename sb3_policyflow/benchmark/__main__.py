@@ -5,6 +5,7 @@ import importlib
 import sys
 
 SUBCOMMANDS = {
+    "demo": "train PolicyFlow on MultiGoal and show which goals it reaches",
     "run": "train and evaluate algorithms, environments and seeds",
     "table": "sum up what was run",
     "plot": "draw learning curves and probabilities of improvement",

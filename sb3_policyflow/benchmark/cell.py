@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_policyflow.benchmark import costs
 from sb3_policyflow.benchmark.evaluation import EvaluationCallback
+from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.goals import goal_report, sample_trajectories
 from sb3_policyflow.benchmark.results import Cell, Result
 
@@ -29,7 +29,9 @@ def train_cell(cell: Cell, folder: Path) -> Result:
     :param folder: Where the results go.
     """
     with tempfile.TemporaryDirectory() as logs:
-        manager = _experiment(cell, logs)
+        manager = make_experiment(
+            cell.algo, cell.env, cell.steps, cell.seed, logs, cell.hyperparams
+        )
         setup = manager.setup_experiment()
         assert setup is not None
         model, hyperparams = setup
@@ -49,22 +51,6 @@ def train_cell(cell: Cell, folder: Path) -> Result:
     result = Result(cell, summary, evaluations.curve)
     result.save(folder)
     return result
-
-
-def _experiment(cell: Cell, logs: str) -> ExperimentManager:
-    """rl_zoo3's experiment: the YAML files are those of ``python -m rl_zoo3.train``."""
-    return ExperimentManager(
-        argparse.Namespace(),
-        cell.algo,
-        cell.env,
-        logs,
-        n_timesteps=cell.steps,
-        eval_freq=-1,
-        hyperparams=dict(cell.hyperparams),
-        seed=cell.seed,
-        verbose=0,
-        device="cpu",
-    )
 
 
 def _due(cell: Cell) -> list[int]:
