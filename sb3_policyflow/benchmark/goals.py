@@ -1,0 +1,206 @@
+"""How many of MultiGoal's six goals a policy reaches, and how evenly.
+
+From the centre of the workspace all goals are equally good, so an optimal policy that keeps all
+its options reaches each with probability 1/6. The paper shows this as a picture of 1000
+trajectories; here it is also a number, the normalised entropy over goals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch as th
+from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_policyflow.envs.multigoal import (
+    GOALS,
+    MAX_EPISODE_STEPS,
+    SUCCESS_RADIUS,
+    MultiGoalVecEnv,
+    nearest_goal,
+)
+
+FloatArray = NDArray[np.float64]
+CENTRE = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """One episode a row.
+
+    :param positions: the episodes' positions, start included, NaN after an episode's end; shape
+        ``(n, MAX_EPISODE_STEPS + 1, 2)``
+    :param lengths: the episodes' numbers of steps, shape ``(n,)``
+    :param returns: the episodes' sums of rewards, shape ``(n,)``
+    """
+
+    positions: FloatArray
+    lengths: NDArray[np.int_]
+    returns: FloatArray
+
+    def ends(self) -> FloatArray:
+        """Where each episode ended, shape ``(n, 2)``."""
+        ends: FloatArray = self.positions[np.arange(len(self.lengths)), self.lengths]
+        return ends
+
+    def goals(self, radius: float = SUCCESS_RADIUS) -> NDArray[np.int_]:
+        """Index of the goal within ``radius`` of each episode's end, -1 for none; shape ``(n,)``.
+
+        :raises ValueError: for a radius that two goals could share (or that is not positive)
+        """
+        if not 0.0 < radius < 2.5:
+            raise ValueError(
+                f"The goals are 5 apart: give a radius between 0 and 2.5, not {radius}."
+            )
+        nearest, squared = nearest_goal(self.ends())
+        return np.where(squared <= radius**2, nearest, -1)
+
+
+@dataclass(frozen=True)
+class GoalReport:
+    """What ``n`` episodes from the centre came to.
+
+    :param counts: episodes that ended at each goal
+    :param n_missed: episodes that ended at none
+    :param entropy: ``normalised_entropy(counts)``
+    :param mean_return: mean sum of rewards (from the centre: not the training return, whose starts
+        are spread over the workspace)
+    """
+
+    counts: tuple[int, ...]
+    n_missed: int
+    entropy: float
+    mean_return: float
+
+    @property
+    def n_goals(self) -> int:
+        """Number of goals that at least one episode ended at."""
+        return sum(count > 0 for count in self.counts)
+
+    @property
+    def share_missed(self) -> float:
+        """Share of the episodes that ended at no goal."""
+        return self.n_missed / (sum(self.counts) + self.n_missed)
+
+    def __str__(self) -> str:
+        counts = " ".join(map(str, self.counts))
+        return (
+            f"{self.n_goals} of {len(self.counts)} goals reached ({counts}; no goal: "
+            f"{self.n_missed}), normalised entropy {self.entropy:.2f}, "
+            f"mean return {self.mean_return:.2f}"
+        )
+
+
+def sample_trajectories(
+    model: PolicyPredictor, n: int = 1000, deterministic: bool = False, seed: int | None = 0
+) -> Trajectories:
+    """Run ``n`` episodes that start at rest in the centre of the workspace.
+
+    If the model was trained under ``VecNormalize``, it sees observations normalised the same way.
+
+    :param model: any SB3 algorithm, or another object with its ``predict``
+    :param n: number of episodes
+    :param deterministic: passed to ``predict``; a deterministic policy has one trajectory only
+    :param seed: makes the policy's draws repeatable without touching the caller's generators;
+        ``None`` to go on from wherever they are
+    """
+    env = MultiGoalVecEnv(n, seed=seed)
+    env.set_options({"position": CENTRE})
+    normalise = _normaliser(model)
+
+    def act(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        actions: NDArray[np.float32] = model.predict(
+            normalise(observations), deterministic=deterministic
+        )[0]
+        return actions
+
+    with _seeded(seed):
+        return _run_episodes(env, act)
+
+
+def _run_episodes(
+    env: MultiGoalVecEnv, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+) -> Trajectories:
+    """The first episode of each environment."""
+    n = env.num_envs
+    positions = np.full((n, MAX_EPISODE_STEPS + 1, 2), np.nan)
+    lengths, returns, running = np.zeros(n, dtype=int), np.zeros(n), np.ones(n, dtype=bool)
+    observations = np.asarray(env.reset())
+    positions[:, 0] = observations[:, :2]
+    for step in range(1, MAX_EPISODE_STEPS + 1):
+        following, rewards, dones, infos = env.step(act(observations))
+        observations = np.asarray(following)
+        reached = observations[:, :2].copy()
+        for i in np.flatnonzero(dones):
+            reached[i] = infos[i]["terminal_observation"][:2]
+        positions[running, step] = reached[running]
+        lengths += running
+        returns += rewards * running
+        running &= ~dones
+    return Trajectories(positions, lengths, returns)
+
+
+def _normaliser(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    vec_normalize: VecNormalize | None = getattr(model, "get_vec_normalize_env", lambda: None)()
+    if vec_normalize is None:
+        return lambda observations: observations
+    return lambda observations: np.asarray(vec_normalize.normalize_obs(observations))
+
+
+@contextmanager
+def _seeded(seed: int | None) -> Iterator[None]:
+    if seed is None:
+        yield
+        return
+    numpy_state = np.random.get_state()
+    with th.random.fork_rng():
+        th.manual_seed(seed)
+        np.random.seed(seed)
+        try:
+            yield
+        finally:
+            np.random.set_state(numpy_state)
+
+
+def goal_counts(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> NDArray[np.int_]:
+    """How many episodes ended within ``radius`` of each goal, shape ``(6,)``."""
+    goals = trajectories.goals(radius)
+    return np.bincount(goals[goals >= 0], minlength=len(GOALS))
+
+
+def normalised_entropy(counts: ArrayLike) -> float:
+    r"""Entropy of the shares over its greatest value, ``-sum p log p / log n``; 0 if all are 0.
+
+    >>> round(normalised_entropy([70, 72, 280, 136, 127, 87]), 2)
+    0.92
+
+    :param counts: non-negative numbers, at least two
+    """
+    array = np.asarray(counts, dtype=np.float64)
+    if array.ndim != 1 or len(array) < 2 or not (array >= 0).all():
+        raise ValueError(f"Entropy needs two or more counts, none negative, not {counts!r}.")
+    shares = array[array > 0] / array.sum() if array.any() else np.ones(1)
+    return float(abs(np.sum(shares * np.log(shares))) / np.log(len(array)))
+
+
+def goal_report(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> GoalReport:
+    """Sum up episodes by the goals they ended at."""
+    counts = goal_counts(trajectories, radius)
+    return GoalReport(
+        counts=tuple(counts.tolist()),
+        n_missed=len(trajectories.lengths) - int(counts.sum()),
+        entropy=normalised_entropy(counts),
+        mean_return=float(trajectories.returns.mean()),
+    )
+
+
+def evaluate_goals(
+    model: PolicyPredictor, n: int = 1000, deterministic: bool = False, seed: int | None = 0
+) -> GoalReport:
+    """``goal_report`` of ``sample_trajectories``, with its arguments."""
+    return goal_report(sample_trajectories(model, n, deterministic, seed))

@@ -1,0 +1,134 @@
+"""Anti-aliased lines and discs on an RGB array, and the MultiGoal picture made of them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+# Okabe and Ito's palette, told apart by colour-blind readers too; one colour for each goal.
+GOAL_COLOURS: tuple[Colour, ...] = (
+    (0.00, 0.45, 0.70),
+    (0.90, 0.62, 0.00),
+    (0.00, 0.62, 0.45),
+    (0.80, 0.47, 0.65),
+    (0.84, 0.37, 0.00),
+    (0.34, 0.71, 0.91),
+)
+INK: Colour = (0.13, 0.15, 0.19)
+MARGIN: Colour = (0.88, 0.89, 0.91)
+
+
+class Canvas:
+    """A square picture of the plane's region ``|x|, |y| <= half_width``, y upwards.
+
+    :param size: width and height in pixels
+    :param half_width: half the width of the region, in the plane's units
+    """
+
+    def __init__(self, size: int, half_width: float) -> None:
+        self.half_width = half_width
+        self.scale = size / (2 * half_width)
+        self.image: FloatArray = np.ones((size, size, 3))
+
+    def pixel(self, point: ArrayLike) -> FloatArray:
+        """Column and row of a point of the plane, pixel centres at whole numbers."""
+        x, y = np.asarray(point, dtype=np.float64)
+        return np.array([x + self.half_width, self.half_width - y]) * self.scale - 0.5
+
+    def centres(self) -> FloatArray:
+        """The plane's points at the pixel centres, shape ``(size, size, 2)``."""
+        along = (np.arange(len(self.image)) + 0.5) / self.scale - self.half_width
+        return np.stack(np.meshgrid(along, -along), axis=-1)
+
+    def line(
+        self,
+        start: ArrayLike,
+        end: ArrayLike,
+        width: float,
+        colour: Colour,
+        opacity: float = 1.0,
+    ) -> None:
+        """Draw a line with round ends.
+
+        A pixel is covered by ``clip(width / 2 - distance to the segment + 1/2, 0, 1)``, in pixels.
+
+        :param start: the segment's first point
+        :param end: its last point; the same as ``start`` draws a disc
+        :param width: in the plane's units
+        :param colour: red, green and blue in [0, 1]
+        :param opacity: in [0, 1]
+        """
+        first, last = self.pixel(start), self.pixel(end)
+        reach = width * self.scale / 2 + 0.5
+        low = np.floor(np.minimum(first, last) - reach).astype(int).clip(0)
+        high = np.ceil(np.maximum(first, last) + reach).astype(int) + 1
+        window = self.image[low[1] : high[1].clip(0), low[0] : high[0].clip(0)]
+        rows, columns = np.ogrid[: window.shape[0], : window.shape[1]]
+        distance = _distance_to_segment(columns + low[0], rows + low[1], first, last)
+        cover = opacity * (reach - distance).clip(0, 1)[..., None]
+        window += cover * (np.array(colour) - window)
+
+    def disc(self, centre: ArrayLike, radius: float, colour: Colour, opacity: float = 1.0) -> None:
+        """Draw a filled circle; the arguments are those of ``line``."""
+        self.line(centre, centre, 2 * radius, colour, opacity)
+
+    def to_uint8(self) -> NDArray[np.uint8]:
+        """The picture as bytes, shape ``(size, size, 3)``."""
+        return (self.image * 255 + 0.5).astype(np.uint8)
+
+
+def _distance_to_segment(
+    x: NDArray[np.int_], y: NDArray[np.int_], start: FloatArray, end: FloatArray
+) -> FloatArray:
+    along = end - start
+    dx, dy = x - start[0], y - start[1]
+    share = ((dx * along[0] + dy * along[1]) / max(float(along @ along), 1e-12)).clip(0, 1)
+    distance: FloatArray = np.hypot(dx - share * along[0], dy - share * along[1])
+    return distance
+
+
+def draw_multigoal(
+    goals: FloatArray, wall: float, trail: FloatArray, size: int
+) -> NDArray[np.uint8]:
+    """The workspace, its goals and the path of one episode, shape ``(size, size, 3)``.
+
+    :param goals: shape ``(n_goals, 2)``
+    :param wall: the workspace is ``|x|, |y| <= wall``
+    :param trail: the positions so far, oldest first, shape ``(n, 2)``
+    :param size: width and height in pixels
+    """
+    canvas = Canvas(size, half_width=wall * 1.06)
+    canvas.image = _workspace(tuple(map(tuple, goals.tolist())), wall, size).copy()
+    for age, (start, end) in enumerate(pairwise(trail), start=1):
+        canvas.line(start, end, 0.12, _faded(INK, 0.2 + 0.8 * age / len(trail)))
+    canvas.disc(trail[0], 0.14, _faded(INK, 0.4))
+    canvas.disc(trail[-1], 0.30, (1.0, 1.0, 1.0))
+    canvas.disc(trail[-1], 0.23, INK)
+    return canvas.to_uint8()
+
+
+def _faded(colour: Colour, strength: float) -> Colour:
+    red, green, blue = (1 - strength * (1 - part) for part in colour)
+    return red, green, blue
+
+
+@lru_cache(maxsize=4)
+def _workspace(goals: tuple[tuple[float, float], ...], wall: float, size: int) -> FloatArray:
+    """What all frames share: each goal's glow (as wide as its reward), the goals, the walls."""
+    canvas = Canvas(size, half_width=wall * 1.06)
+    points = canvas.centres()
+    squared = np.square(points[:, :, None] - np.array(goals)).sum(axis=-1)
+    colours = np.array([GOAL_COLOURS[i % len(GOAL_COLOURS)] for i in range(len(goals))])
+    glow = 0.30 * np.exp(-0.2 * squared)[..., None] * (1 - colours)
+    canvas.image = (1 - glow.sum(axis=2)).clip(0, 1)
+    canvas.image[np.abs(points).max(axis=-1) > wall] = MARGIN
+    for goal, colour in zip(goals, colours.tolist(), strict=True):
+        canvas.disc(goal, 0.42, (1.0, 1.0, 1.0))
+        canvas.disc(goal, 0.34, colour)
+    return canvas.image
