@@ -1,10 +1,15 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
-from sb3_policyflow import envs as _envs
+import sb3_policyflow_startup
+from sb3_policyflow import envs
+from sb3_policyflow.dppo import DPPO
+from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
 __version__ = "0.1.0"
 
-__all__ = ["PolicyFlow", "__version__"]
+__all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]
 
-_envs.register()
+envs.register()
+# For interpreters that read no .pth files; others have done it at startup.
+sb3_policyflow_startup.install()

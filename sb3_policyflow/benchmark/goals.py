@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_policyflow.envs.multigoal import (
+from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.envs.point_masses import (
     GOALS,
     MAX_EPISODE_STEPS,
     SUCCESS_RADIUS,
-    MultiGoalVecEnv,
     nearest_goal,
 )
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sb3_policyflow.benchmark.goals import Trajectories, goal_report
 from sb3_policyflow.envs.drawing import GOAL_COLOURS, INK
-from sb3_policyflow.envs.multigoal import GOALS, WALL
+from sb3_policyflow.envs.point_masses import GOALS, WALL
 
 FloatArray = NDArray[np.float64]
 

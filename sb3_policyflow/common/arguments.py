@@ -38,6 +38,9 @@ class FlowAlgorithmArguments(CollectionMixin):
     """
 
     policy_base: ClassVar[type[FlowActorCriticPolicy]]
+    policy_arguments: ClassVar[tuple[str, ...]] = ()
+    """Arguments of the algorithm that it hands on to its policy."""
+
     policy: FlowActorCriticPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
 
@@ -146,7 +149,11 @@ class FlowAlgorithmArguments(CollectionMixin):
 
     def _complete_policy_kwargs(self) -> dict[str, Any]:
         """The user's ``policy_kwargs`` with what the algorithm's own arguments add to them."""
-        return self.policy_kwargs
+        twice = [name for name in self.policy_arguments if name in self.policy_kwargs]
+        if twice:
+            raise ValueError(f"Give {twice} to {type(self).__name__} itself, not in policy_kwargs.")
+        own = {name: getattr(self, name) for name in self.policy_arguments}
+        return {**self.policy_kwargs, **own}
 
     def _setup_schedules(self) -> None:
         """Turn coefficients into functions of the remaining progress."""

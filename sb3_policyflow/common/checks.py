@@ -33,6 +33,15 @@ def check_at_least(name: str, value: float, lowest: float) -> None:
         raise ValueError(f"{name} must be at least {lowest}, got {value!r}.")
 
 
+def check_positive_or_none(name: str, value: float | None) -> None:
+    """Refuse a bound that leaves nothing.
+
+    :raises ValueError: If there is one that is not positive.
+    """
+    if value is not None and not value > 0:
+        raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
+
+
 def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any]) -> None:
     """Refuse a policy of another kind.
 

@@ -1,6 +1,7 @@
 """The terms of the objective as pure functions of tensors."""
 
 import math
+from collections.abc import Callable
 
 import torch as th
 
@@ -60,7 +61,9 @@ def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
     return (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
 
 
-def clipped_surrogate(log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float) -> th.Tensor:
+def clipped_surrogate(
+    log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
+) -> th.Tensor:
     """PPO's clipped objective for each sample, to be maximised (paper, J^Flow).
 
     min(rho A, clip(rho, 1 - epsilon, 1 + epsilon) A)
@@ -70,9 +73,61 @@ def clipped_surrogate(log_ratio: th.Tensor, advantages: th.Tensor, clip_range: f
 
     :param log_ratio: log rho, shape (...).
     :param advantages: A, a shape that broadcasts with it.
-    :param clip_range: epsilon.
+    :param clip_range: epsilon, one number or a shape that broadcasts too.
     :return: The objective, shape (...).
     """
     ratio = log_ratio.exp()
-    clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+    clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)  # type: ignore[arg-type]
     return th.min(ratio * advantages, clipped * advantages)
+
+
+def penalised_surrogate(
+    log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
+) -> th.Tensor:
+    """SPO's objective for each sample, to be maximised (Xie et al., 2024, arXiv 2401.16025).
+
+    rho A - |A| / (2 epsilon) (rho - 1)^2,    greatest at rho = 1 + epsilon sign(A)
+
+    >>> penalised_surrogate(th.tensor(2.0).log(), th.tensor([1.0, -1.0]), 0.5)
+    tensor([ 1., -3.])
+
+    Takes and returns the shapes of :func:`clipped_surrogate`.
+    """
+    ratio = log_ratio.exp()
+    return ratio * advantages - advantages.abs() / (2 * clip_range) * (ratio - 1) ** 2
+
+
+def asymmetric_surrogate(
+    log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
+) -> th.Tensor:
+    """FPO++'s objective (ASPO, arXiv 2602.02481): PPO's where A >= 0, SPO's where A < 0.
+
+    >>> asymmetric_surrogate(th.tensor(2.0).log(), th.tensor([1.0, -1.0]), 0.5)
+    tensor([ 1.5000, -3.0000])
+
+    Takes and returns the shapes of :func:`clipped_surrogate`.
+    """
+    arguments = log_ratio, advantages, clip_range
+    return th.where(advantages < 0, penalised_surrogate(*arguments), clipped_surrogate(*arguments))
+
+
+SURROGATES: dict[str, Callable[[th.Tensor, th.Tensor, float | th.Tensor], th.Tensor]] = {
+    "ppo": clipped_surrogate,
+    "spo": penalised_surrogate,
+    "aspo": asymmetric_surrogate,
+}
+"""Objectives that keep the policy near the old one, by the name of their trust region."""
+
+
+def ratio_divergence(log_ratio: th.Tensor) -> th.Tensor:
+    """KL(old || new) in nats, estimated from importance ratios as SB3's PPO does.
+
+    mean of rho - 1 - log rho    (Schulman, "Approximating KL divergence")
+
+    >>> round(ratio_divergence(th.tensor([1.0, 3.0]).log()).item(), 4)  # (2 - log 3) / 2
+    0.4507
+
+    :param log_ratio: log rho, shape (...).
+    :return: The divergence, a tensor without dimensions.
+    """
+    return (th.expm1(log_ratio) - log_ratio).mean()

@@ -1,14 +1,14 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.utils import explained_variance
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from sb3_policyflow.common.arguments import FlowAlgorithmArguments
-from sb3_policyflow.common.losses import clipped_surrogate
+from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.metrics import UpdateMetrics
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 
@@ -18,6 +18,10 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
 
     For arguments see :class:`~sb3_policyflow.common.arguments.FlowAlgorithmArguments`.
     """
+
+    trust_region: str = "ppo"
+    divergence_advice: ClassVar[str] = ""
+    """What else than a lower learning rate helps against gradients that are not finite."""
 
     # What siblings supply
 
@@ -117,9 +121,13 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         return batch.advantages
 
     def _surrogate(self, log_ratio: th.Tensor, advantages: th.Tensor) -> th.Tensor:
-        """The clipped objective, of the shape (n, ...) of ``log_ratio``."""
+        """The objective within the trust region, of the shape (n, ...) of ``log_ratio``."""
         advantages = advantages.reshape(-1, *[1] * (log_ratio.dim() - 1))
-        return clipped_surrogate(log_ratio, advantages, self._now(self.clip_range))
+        return SURROGATES[self.trust_region](log_ratio, advantages, self._clip_range_now())
+
+    def _clip_range_now(self) -> float | th.Tensor:
+        """Epsilon at the present progress, one number or of a shape that fits the log ratio."""
+        return self._now(self.clip_range)
 
     def _value_loss(self, batch: FlowRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         """Mean squared error of the (clipped) values against the TD(lambda) returns."""
@@ -132,7 +140,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     @th.no_grad()
     def _ratio_figures(self, log_ratio: th.Tensor) -> dict[str, th.Tensor]:
         ratio = log_ratio.exp()
-        clipped = (ratio - 1).abs() > self._now(self.clip_range)
+        clipped = (ratio - 1).abs() > self._clip_range_now()
         return {
             "clip_fraction": clipped.float().mean(),
             "ratio_mean": ratio.mean(),
@@ -153,11 +161,14 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             raise FloatingPointError(
                 f"The gradient is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
                 "The parameters are those of the last good step and can be saved: lower the "
-                "learning rate, or keep the noise's log_std_bounds away from zero."
+                f"learning rate{self.divergence_advice}."
             )
         self.policy.optimizer.step()
 
     # The log
+
+    def _log_policy(self) -> None:
+        """Log what else is worth knowing of the policy after an update."""
 
     def _log_update(self, metrics: UpdateMetrics, approx_kl: float) -> None:
         for name, value in metrics.summary().items():
@@ -167,7 +178,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         buffer = self.rollout_buffer
         explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", explained)
-        self.logger.record("train/std", self.policy.noise_log_std.exp().mean().item())
+        self._log_policy()
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/clip_range", self._now(self.clip_range))
         if self.clip_range_vf is not None:

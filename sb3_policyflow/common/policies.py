@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -18,16 +18,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.flows import VelocityField
-
-OWN_PARAMETERS = (
-    "share_features_extractor",
-    "embedding_dim",
-    "frequencies",
-    "frequency_scale",
-    "initialisation",
-    "log_std_bounds",
-)
-"""Constructor arguments that SB3's ``save`` of a policy does not know of."""
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -47,7 +37,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param ortho_init: Whether to initialise features extractor and critic orthogonally, as SB3
         does. The velocity field has its own ``initialisation``.
     :param use_sde: Not supported.
-    :param log_std_init: Initial log standard deviation of the Gaussian noise.
     :param features_extractor_class: Features extractor.
     :param features_extractor_kwargs: Keyword arguments of the features extractor.
     :param share_features_extractor: Whether actor and critic share the features extractor.
@@ -58,11 +47,21 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param frequencies: Frequencies of the time embedding, or how many to draw.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
     :param initialisation: "glorot", "glorot_zero_output" or "zero".
-    :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
     :raises ValueError: If an option is not supported.
     """
 
+    own_parameters: ClassVar[tuple[str, ...]] = (
+        "share_features_extractor",
+        "embedding_dim",
+        "frequencies",
+        "frequency_scale",
+        "initialisation",
+    )
+    """Constructor arguments that SB3's ``save`` of a policy does not know of."""
+
     mlp_extractor: MlpExtractor
+    random_latents: bool = False
+    """Whether ``predict(deterministic=True)`` draws the latents and leaves out the noise only."""
 
     def __init__(
         self,
@@ -73,7 +72,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = True,
         use_sde: bool = False,
-        log_std_init: float = 0.0,
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
@@ -84,14 +82,12 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
         initialisation: str = "glorot_zero_output",
-        log_std_bounds: tuple[float, float] | None = None,
     ) -> None:
         check_flow_spaces(action_space, use_sde)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
         self.initialisation = initialisation
-        self.log_std_bounds = log_std_bounds
         if net_arch is None and features_extractor_class is NatureCNN:
             # SB3 puts no layer behind its CNN, but a velocity without one is linear in the action.
             net_arch = {"pi": [64, 64], "vf": []}
@@ -102,7 +98,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             net_arch=net_arch,
             activation_fn=activation_fn,
             ortho_init=ortho_init,
-            log_std_init=log_std_init,
             features_extractor_class=features_extractor_class,
             features_extractor_kwargs=features_extractor_kwargs,
             share_features_extractor=share_features_extractor,
@@ -113,9 +108,9 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        for sde_option in ("use_sde", "full_std", "use_expln", "squash_output"):
-            del data[sde_option]
-        return {**data, **{name: getattr(self, name) for name in OWN_PARAMETERS}}
+        for foreign in ("use_sde", "full_std", "use_expln", "squash_output", "log_std_init"):
+            del data[foreign]
+        return {**data, **{name: getattr(self, name) for name in self.own_parameters}}
 
     @property
     def action_dim(self) -> int:
@@ -138,7 +133,17 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        del self.action_net
+        # Those of a Gaussian actor, as is the optimizer.
+        del self.action_net, self.log_std
+        self._build_actor()
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]  # every torch optimizer takes one
+            **self.optimizer_kwargs,
+        )
+
+    def _build_actor(self) -> None:
+        """Build what the actor learns, apart from the features extractor."""
         self.velocity = VelocityField(
             self.action_dim,
             self.features_dim,
@@ -149,19 +154,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             frequency_scale=self.frequency_scale,
             initialisation=self.initialisation,
         )
-        # SB3 made one for the parameters of a Gaussian actor.
-        self.optimizer = self.optimizer_class(
-            self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]  # every torch optimizer takes one
-            **self.optimizer_kwargs,
-        )
-
-    @property
-    def noise_log_std(self) -> th.Tensor:
-        """Logarithm of sigma of the Gaussian noise within its bounds, shape (action_dim,)."""
-        if self.log_std_bounds is None:
-            return self.log_std
-        return self.log_std.clamp(*self.log_std_bounds)
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim)."""
@@ -177,6 +169,11 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         """Estimated values of states with these features, shape (n, 1)."""
         values: th.Tensor = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
+
+    def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
+        """Z ~ N(0, I), or 0 for the deterministic action, shape (n, action_dim)."""
+        draw = th.zeros if deterministic and not self.random_latents else th.randn
+        return draw(len(features), self.action_dim, device=features.device, dtype=features.dtype)
 
     @abstractmethod
     def sample_actions(
@@ -235,5 +232,6 @@ def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
     if use_sde:
         raise ValueError(
             "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
-            "leave it out, and set the noise with policy_kwargs=dict(log_std_init=...)."
+            "leave it out. The noise has options of its own, such as PolicyFlow's "
+            "policy_kwargs=dict(log_std_init=...)."
         )

@@ -16,8 +16,8 @@ def parse_schedule(name: str, value: Coefficient) -> FloatSchedule:
 
     >>> parse_schedule("brownian_coef", "lin_0.25")(0.5)
     0.125
-    >>> parse_schedule("brownian_coef", "lin_0.25_0.05")(0.0)  # falls to a floor
-    0.05
+    >>> parse_schedule("brownian_coef", "lin_1_0.5")(0.0)  # falls to a floor
+    0.5
 
     :param name: The coefficient's name, for error messages.
     :param value: A number that is not negative, "lin_START" (falls linearly to zero),

@@ -1,4 +1,4 @@
-"""Anti-aliased lines and discs on an RGB array, and the MultiGoal picture made of them."""
+"""Anti-aliased lines and discs on an RGB array, and the environments' pictures made of them."""
 
 from __future__ import annotations
 
@@ -105,12 +105,36 @@ def draw_multigoal(
     """
     canvas = Canvas(size, half_width=wall * 1.06)
     canvas.image = _workspace(tuple(map(tuple, goals.tolist())), wall, size).copy()
-    for age, (start, end) in enumerate(pairwise(trail), start=1):
-        canvas.line(start, end, 0.12, _faded(INK, 0.2 + 0.8 * age / len(trail)))
-    canvas.disc(trail[0], 0.14, _faded(INK, 0.4))
-    canvas.disc(trail[-1], 0.30, (1.0, 1.0, 1.0))
-    canvas.disc(trail[-1], 0.23, INK)
+    _draw_trail(canvas, trail, width=0.12)
     return canvas.to_uint8()
+
+
+def draw_maze(
+    free: NDArray[np.bool_], goals: FloatArray, trail: FloatArray, size: int
+) -> NDArray[np.uint8]:
+    """A square maze from above, its goals and the path of one episode.
+
+    :param free: whether each cell is free, rows from the top, shape ``(n, n)``
+    :param goals: shape ``(n_goals, 2)``, the maze's cells having side 1 and its centre the origin
+    :param trail: the positions so far, oldest first, shape ``(n_positions, 2)``
+    :param size: width and height in pixels
+    """
+    canvas = Canvas(size, half_width=len(free) / 2)
+    cell = np.arange(size) * len(free) // size
+    canvas.image[~free[np.ix_(cell, cell)]] = MARGIN
+    for goal in goals:
+        canvas.disc(goal, 0.2, GOAL_COLOURS[4])
+    _draw_trail(canvas, trail, width=0.06)
+    return canvas.to_uint8()
+
+
+def _draw_trail(canvas: Canvas, trail: FloatArray, width: float) -> None:
+    """A line that darkens towards the present, from a small disc to a large one."""
+    for age, (start, end) in enumerate(pairwise(trail), start=1):
+        canvas.line(start, end, width, _faded(INK, 0.2 + 0.8 * age / len(trail)))
+    canvas.disc(trail[0], 1.2 * width, _faded(INK, 0.4))
+    canvas.disc(trail[-1], 2.5 * width, (1.0, 1.0, 1.0))
+    canvas.disc(trail[-1], 1.9 * width, INK)
 
 
 def _faded(colour: Colour, strength: float) -> Colour:

@@ -1,8 +1,21 @@
 """Continuous normalizing flows for policies, in plain torch: fields, paths, solvers and times."""
 
-from sb3_policyflow.flows.paths import PATHS, Path, Rectified, StochasticInterpolant, TrigFlow
+from sb3_policyflow.flows.paths import (
+    PATHS,
+    ExactStochasticInterpolant,
+    Path,
+    Rectified,
+    StochasticInterpolant,
+    TrigFlow,
+)
 from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
-from sb3_policyflow.flows.times import TIME_SAMPLERS, GridTimes, TimeSampler, UniformTimes
+from sb3_policyflow.flows.times import (
+    TIME_SAMPLERS,
+    GridTimes,
+    StartTimes,
+    TimeSampler,
+    UniformTimes,
+)
 from sb3_policyflow.flows.velocity import INITIALISATIONS, FourierTimeEmbedding, VelocityField
 
 __all__ = [
@@ -10,11 +23,13 @@ __all__ = [
     "PATHS",
     "SOLVERS",
     "TIME_SAMPLERS",
+    "ExactStochasticInterpolant",
     "FourierTimeEmbedding",
     "GridTimes",
     "Path",
     "Rectified",
     "Solver",
+    "StartTimes",
     "StochasticInterpolant",
     "TimeSampler",
     "TrigFlow",

@@ -153,6 +153,18 @@ class StochasticInterpolant(Path):
         return ScoreCoefficients(2 * (times - 0.5) ** 2 + 0.5, times, th.ones_like(times))
 
 
+class ExactStochasticInterpolant(StochasticInterpolant):
+    """The stochastic interpolant with the relation that holds for Gaussian latents.
+
+    Latent and noise together are Gaussian of variance (1 - t)^2 + 2 t (1 - t) = 1 - t^2, so that
+    x_t = t phi + sqrt(1 - t^2) e and grad log p_t = t v_t - x, whatever the end points. The paper's
+    coefficient lacks 2 t (1 - t) of it.
+    """
+
+    def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
+        return ScoreCoefficients(th.ones_like(times), times, th.ones_like(times))
+
+
 class TrigFlow(Path):
     """The path along a quarter of a circle.
 
@@ -174,5 +186,6 @@ class TrigFlow(Path):
 PATHS: dict[str, type[Path]] = {
     "rectified": Rectified,
     "stochastic": StochasticInterpolant,
+    "stochastic_exact": ExactStochasticInterpolant,
     "trigflow": TrigFlow,
 }

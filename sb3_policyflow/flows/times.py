@@ -31,6 +31,18 @@ class GridTimes:
         return self.grid[th.randint(len(self.grid), size, device=self.grid.device)]
 
 
+class StartTimes(GridTimes):
+    """Times drawn uniformly from a grid without its end; with Euler, those at which steps start.
+
+    >>> times = StartTimes(th.tensor([0.0, 0.5, 1.0])).sample(100, 1)
+    >>> sorted(set(times.flatten().tolist()))
+    [0.0, 0.5]
+    """
+
+    def __init__(self, grid: th.Tensor) -> None:
+        super().__init__(grid[:-1])
+
+
 class UniformTimes:
     """Times drawn uniformly between the grid's ends (paper: USC).
 
@@ -50,7 +62,8 @@ class UniformTimes:
         return start + (end - start) * fractions
 
 
-TIME_SAMPLERS: dict[str, type[GridTimes] | type[UniformTimes]] = {
+TIME_SAMPLERS: dict[str, type[GridTimes | UniformTimes]] = {
     "grid": GridTimes,
+    "starts": StartTimes,
     "uniform": UniformTimes,
 }

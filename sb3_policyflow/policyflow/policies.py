@@ -1,20 +1,16 @@
 """Policies of PolicyFlow: an action is the end of a flow plus Gaussian noise."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
-    CombinedExtractor,
-    NatureCNN,
-)
 from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
 
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
-from sb3_policyflow.flows import PATHS, SOLVERS, integrate
+from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
+from sb3_policyflow.common.ode_policy import OdeFlowPolicy
+from sb3_policyflow.flows import PATHS
 from sb3_policyflow.flows.choices import choose
-from sb3_policyflow.flows.solvers import solver_times
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -24,18 +20,28 @@ class PolicyFlowRecord(NamedTuple):
     endpoints: th.Tensor
 
 
-class FlowPolicy(FlowActorCriticPolicy):
+class FlowPolicy(OdeFlowPolicy):
     """Actor-critic policy that carries Gaussian latents along a flow (paper, policy of PolicyFlow).
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
 
-    :param path: "rectified", "stochastic" or "trigflow": the interpolation path of the update,
-        whose ``end_time`` T is where the flow ends.
+    :param log_std_init: Initial log standard deviation of the Gaussian noise.
+    :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
+    :param path: "rectified", "stochastic", "stochastic_exact" or "trigflow": the interpolation
+        path of the update, whose ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
+    :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
     """
+
+    own_parameters: ClassVar[tuple[str, ...]] = (
+        *OdeFlowPolicy.own_parameters,
+        "log_std_init",
+        "log_std_bounds",
+        "gaussian",
+    )
 
     def __init__(
         self,
@@ -43,77 +49,69 @@ class FlowPolicy(FlowActorCriticPolicy):
         action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         *args: Any,
+        log_std_init: float = 0.0,
+        log_std_bounds: tuple[float, float] | None = None,
         path: str = "rectified",
         n_flow_steps: int = 12,
         solver: str = "midpoint",
+        gaussian: bool = False,
         **kwargs: Any,
     ) -> None:
+        self.log_std_bounds = log_std_bounds
         self.path_name = path
-        self.path = choose("path", path, PATHS)()
-        self.n_flow_steps = n_flow_steps
-        self.solver = solver
-        choose("solver", solver, SOLVERS)
-        solver_times(solver, n_flow_steps)
-        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
+        self.gaussian = gaussian
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            *args,
+            flow_path=choose("path", path, PATHS)(),
+            n_flow_steps=n_flow_steps,
+            solver=solver,
+            **kwargs,
+        )
+        # SB3 has set both to the defaults of its own actor.
+        self.log_std_init = log_std_init
+        nn.init.constant_(self.log_std, log_std_init)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        flow = {"path": self.path_name, "n_flow_steps": self.n_flow_steps, "solver": self.solver}
-        return {**super()._get_constructor_parameters(), **flow}
+        return {**super()._get_constructor_parameters(), "path": self.path_name}
 
-    def solver_times(self) -> th.Tensor:
-        """The solver's time grid, on the policy's device."""
-        times = solver_times(self.solver, self.n_flow_steps, self.path.end_time)
-        return times.to(self.log_std)
+    def _build_actor(self) -> None:
+        super()._build_actor()
+        self.log_std = nn.Parameter(th.zeros(self.action_dim))
 
-    def carry(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """Carry latents along the flow.
+    @property
+    def noise_log_std(self) -> th.Tensor:
+        """Logarithm of sigma of the Gaussian noise within its bounds, shape (action_dim,)."""
+        if self.log_std_bounds is None:
+            return self.log_std
+        return self.log_std.clamp(*self.log_std_bounds)
 
-        :param latents: z, shape (n, action_dim).
-        :param features: The actor's features, shape (n, features_dim).
-        :return: phi, shape (n, action_dim).
-        """
-        return integrate(
-            lambda points, time: self.velocity(points, time, features),
-            latents,
-            n_steps=self.n_flow_steps,
-            solver=self.solver,
-            end_time=self.path.end_time,
-        )
+    def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
+        """Z ~ N(0, I), or 0 where nothing may be drawn, shape (n, action_dim)."""
+        if self.gaussian:
+            return features.new_zeros(len(features), self.action_dim)
+        return super().draw_latents(features, deterministic)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
         """Draw actions; the deterministic one has z = 0 and n = 0."""
-        size = (2, len(features), self.action_dim)
-        draws = th.zeros if deterministic else th.randn
-        latents, noise = draws(size, device=features.device, dtype=self.log_std.dtype)
+        latents = self.draw_latents(features, deterministic)
         endpoints = self.carry(latents, features)
-        actions = endpoints + noise * self.noise_log_std.exp()
-        return actions, PolicyFlowRecord(latents, endpoints)
+        record = PolicyFlowRecord(latents, endpoints)
+        if deterministic:
+            return endpoints, record
+        return endpoints + th.randn_like(endpoints) * self.noise_log_std.exp(), record
 
 
 MlpFlowPolicy = FlowPolicy
 
 
-class CnnFlowPolicy(FlowPolicy):
+class CnnFlowPolicy(ImageFeatures, FlowPolicy):
     """:class:`FlowPolicy` for images: its default features extractor is SB3's ``NatureCNN``."""
 
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
-
-class MultiInputFlowPolicy(FlowPolicy):
+class MultiInputFlowPolicy(DictFeatures, FlowPolicy):
     """:class:`FlowPolicy` for Dict observations, by default with SB3's ``CombinedExtractor``."""
-
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

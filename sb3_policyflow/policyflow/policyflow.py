@@ -3,11 +3,13 @@
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.aliases import flow_policy_aliases
 from sb3_policyflow.common.losses import (
     gaussian_entropy,
     gaussian_kl,
@@ -25,6 +27,7 @@ from sb3_policyflow.policyflow.policies import (
     MultiInputFlowPolicy,
     PolicyFlowRecord,
 )
+from sb3_policyflow.policyflow.uniform import UniformTargets
 
 SelfPolicyFlow = TypeVar("SelfPolicyFlow", bound="PolicyFlow")
 
@@ -56,27 +59,29 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     :param brownian_coef: w_b, weight of the Brownian regulariser: a constant, "lin_START",
         "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
         entropy of the Gaussian noise and takes the same forms.
-    :param path: Interpolation path: "rectified", "stochastic" or "trigflow".
-    :param time_sampler: Times of the update: "grid" (the solver's own) or "uniform".
+    :param path: Interpolation path: "rectified", "stochastic", "stochastic_exact" or "trigflow".
+    :param time_sampler: Times of the update: "grid" (the solver's own), "starts" (the same without
+        the end) or "uniform".
     :param n_times: Times for each sample.
     :param time_average: With several times, whether each has its own surrogate ("objective") or
         their mean shift makes one ("shift").
     :param n_flow_steps: Solver steps from latent to action.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
     :param brownian_reduction: "sum" over action dimensions, or their "mean".
+    :param gaussian: Whether the latents are always 0, which leaves a Gaussian policy. With
+        ``solver="euler"``, ``n_flow_steps=1`` and ``time_sampler="starts"`` it is PPO's, exactly.
+    :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
+        regulariser (Ding et al., 2024). Takes the forms of ``brownian_coef``.
     :raises ValueError: If an argument cannot be used.
     """
 
     policy_base = FlowPolicy
     policy: FlowPolicy
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpFlowPolicy": MlpFlowPolicy,
-        "CnnFlowPolicy": CnnFlowPolicy,
-        "MultiInputFlowPolicy": MultiInputFlowPolicy,
-        "MlpPolicy": MlpFlowPolicy,
-        "CnnPolicy": CnnFlowPolicy,
-        "MultiInputPolicy": MultiInputFlowPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = flow_policy_aliases(
+        MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
+    )
+    policy_arguments = ("path", "n_flow_steps", "solver", "gaussian")
+    divergence_advice = ", or keep log_std_bounds of the noise away from zero"
 
     def __init__(
         self,
@@ -115,6 +120,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         n_flow_steps: int = 12,
         solver: str = "midpoint",
         brownian_reduction: str = "sum",
+        gaussian: bool = False,
+        uniform_noise_coef: Coefficient = 0.0,
         desired_kl: float | None = None,
         lr_adaptation: str = "epoch",
         lr_factor: float = 1.5,
@@ -168,6 +175,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         self.n_flow_steps = n_flow_steps
         self.solver = solver
         self.brownian_reduction = brownian_reduction
+        self.gaussian = gaussian
+        self.uniform_noise_coef = uniform_noise_coef
         if _init_setup_model:
             self._setup_model()
 
@@ -177,22 +186,25 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         checks.check_at_least("n_times", self.n_times, 1)
         checks.check_choice("time_average", self.time_average, ("objective", "shift"))
         checks.check_choice("brownian_reduction", self.brownian_reduction, ("sum", "mean"))
-
-    def _complete_policy_kwargs(self) -> dict[str, Any]:
-        own = {"path": self.path, "n_flow_steps": self.n_flow_steps, "solver": self.solver}
-        twice = own.keys() & self.policy_kwargs.keys()
-        if twice:
-            raise ValueError(f"Give {sorted(twice)} to PolicyFlow itself, not in policy_kwargs.")
-        return {**super()._complete_policy_kwargs(), **own}
+        if self.gaussian and (self.brownian_coef, self.uniform_noise_coef) != (0.0, 0.0):
+            raise ValueError(
+                "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
+                "and uniform_noise_coef at 0, and use ent_coef."
+            )
 
     def _setup_schedules(self) -> None:
         super()._setup_schedules()
         self._brownian_schedule = parse_schedule("brownian_coef", self.brownian_coef)
-        times = self.policy.solver_times()
-        self._times = TIME_SAMPLERS[self.time_sampler](times)
+        self._times = TIME_SAMPLERS[self.time_sampler](self.policy.solver_times())
+        self._uniform_schedule = parse_schedule("uniform_noise_coef", self.uniform_noise_coef)
+        self._uniform: UniformTargets | None = None
+        if self.uniform_noise_coef != 0.0:
+            assert isinstance(self.action_space, spaces.Box)
+            self._uniform = UniformTargets(self.action_space, self.policy.path)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_brownian_schedule", "_times"]
+        derived = ["_brownian_schedule", "_uniform_schedule", "_uniform", "_times"]
+        return [*super()._excluded_save_params(), *derived]
 
     def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Behaviour:
         """The policy before the update, theta-hat and sigma-hat."""
@@ -219,20 +231,31 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
             shift = shift.mean(dim=1, keepdim=True)
         noise = (batch.actions - batch.record.endpoints).unsqueeze(1)
         log_std, old_log_std = self.policy.noise_log_std, behaviour.log_std
-        brownian_loss = self._brownian_loss(probes, velocity)
-        entropy = gaussian_entropy(log_std)
-        brownian_coef = self._now(self._brownian_schedule)
-        ent_coef = self._now(self._entropy_schedule)
+        regulariser, figures = self._regulariser(probes, velocity, features)
         return PolicyTerms(
             log_ratio=shifted_gaussian_log_ratio(noise, shift, log_std, old_log_std),
             kl=gaussian_kl(shift, log_std, old_log_std).mean(),
-            regulariser=brownian_coef * brownian_loss - ent_coef * entropy,
-            metrics={
-                "brownian_loss": brownian_loss,
-                "entropy_loss": -entropy,
-                "velocity_change": change.detach().norm(dim=-1).mean(),
-            },
+            regulariser=regulariser,
+            metrics={**figures, "velocity_change": change.detach().norm(dim=-1).mean()},
         )
+
+    def _regulariser(
+        self, probes: Probes, velocity: th.Tensor, features: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """What keeps the policy from becoming narrow, and its parts to log."""
+        brownian_loss = self._brownian_loss(probes, velocity)
+        entropy = gaussian_entropy(self.policy.noise_log_std)
+        brownian_coef, ent_coef = (
+            self._now(self._brownian_schedule),
+            self._now(self._entropy_schedule),
+        )
+        regulariser = brownian_coef * brownian_loss - ent_coef * entropy
+        figures = {"brownian_loss": brownian_loss, "entropy_loss": -entropy}
+        if self._uniform is not None:
+            uniform_loss = self._uniform.loss(self.policy.velocity, features)
+            regulariser = regulariser + self._now(self._uniform_schedule) * uniform_loss
+            figures["uniform_noise_loss"] = uniform_loss
+        return regulariser, figures
 
     def _brownian_loss(self, probes: Probes, velocity: th.Tensor) -> th.Tensor:
         """Mean over samples of ||eta||^2 (paper, J^Reg)."""
@@ -242,6 +265,9 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)
         return over_actions.mean()
+
+    def _log_policy(self) -> None:
+        self.logger.record("train/std", self.policy.noise_log_std.exp().mean().item())
 
     def learn(
         self: SelfPolicyFlow,

@@ -23,7 +23,8 @@ from sb3_policyflow.benchmark.plots import (
     read_learning_curve,
 )
 from sb3_policyflow.envs.drawing import GOAL_COLOURS
-from sb3_policyflow.envs.multigoal import GOALS, MultiGoalVecEnv
+from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.envs.point_masses import GOALS
 
 
 def straight_to(ends, n_steps=10):

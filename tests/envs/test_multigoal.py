@@ -15,15 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import sb3_policyflow
 from sb3_policyflow.envs.drawing import GOAL_COLOURS, Canvas
-from sb3_policyflow.envs.multigoal import (
-    FRAME_SIZE,
-    GOALS,
-    WALL,
-    MultiGoalEnv,
-    MultiGoalVecEnv,
-    MultiGoalVectorEnv,
-    nearest_goal,
-)
+from sb3_policyflow.envs.multigoal import MultiGoalEnv, MultiGoalVecEnv, MultiGoalVectorEnv
+from sb3_policyflow.envs.point_masses import FRAME_SIZE, GOALS, WALL, nearest_goal
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 STILL = np.zeros(2, dtype=np.float32)
@@ -274,7 +267,9 @@ def test_gymnasium_makes_both_forms():
     vector = gym.make_vec("MultiGoal-v0", num_envs=3)
     assert isinstance(vector, MultiGoalVectorEnv)
     assert vector.observation_space.shape == (3, 4)
-    assert gym.make_vec("MultiGoal-v0", num_envs=1, max_episode_steps=7).reset()[0].shape == (1, 4)
+    shorter = gym.make_vec("MultiGoal-v0", num_envs=1, max_episode_steps=7)
+    shorter.reset(options={"position": (0.0, 0.0)})
+    assert [bool(shorter.step(STILL[None])[3][0]) for _ in range(7)] == [False] * 6 + [True]
 
 
 def test_registering_twice_is_silent():
@@ -293,6 +288,15 @@ def test_registering_imports_neither_torch_nor_mujoco():
         "assert not {'torch', 'mujoco', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_each_environment_seeds_its_own_spaces():
+    one, other = MultiGoalEnv(), MultiGoalEnv()
+    one.action_space.seed(0)
+    first = one.action_space.sample()
+    one.action_space.seed(0)
+    other.action_space.sample()
+    np.testing.assert_array_equal(one.action_space.sample(), first)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -1,0 +1,64 @@
+"""The entropy of actions, for policies that can only be drawn from."""
+
+import math
+
+import torch as th
+
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+
+SMALLEST_DISTANCE = 1e-6
+"""Actions nearer than this count as this far apart: clipped ones may coincide."""
+
+
+def nearest_neighbour_entropy(samples: th.Tensor) -> th.Tensor:
+    """Differential entropy from the distances of samples to their nearest neighbours.
+
+    H = psi(m) - psi(1) + log V_d + d / m sum_i log r_i    (Kozachenko and Leonenko, 1987)
+
+    with V_d the volume of the unit ball. It has a gradient for samples that have one.
+
+    >>> uniform = th.rand(1000, 32, 1, generator=th.Generator().manual_seed(0))
+    >>> abs(nearest_neighbour_entropy(4 * uniform).item() - math.log(4)) < 0.05
+    True
+
+    :param samples: m samples from each of n distributions, shape (n, m, d) with m of at least 2.
+    :return: The mean entropy in nats, a tensor without dimensions.
+    """
+    n_samples, dim = samples.shape[-2:]
+    distances = th.cdist(samples, samples)
+    itself = th.eye(n_samples, dtype=th.bool, device=samples.device)
+    nearest = distances.masked_fill(itself, math.inf).amin(dim=-1).clamp_min(SMALLEST_DISTANCE)
+    log_ball = 0.5 * dim * math.log(math.pi) - math.lgamma(0.5 * dim + 1)
+    harmonic = math.fsum(1 / i for i in range(1, n_samples))  # psi(m) - psi(1)
+    return harmonic + log_ball + dim * nearest.log().mean()
+
+
+class SampledEntropyMixin(FlowOnPolicyAlgorithm):
+    """Rewards the entropy of the actions, estimated from several in each of some states.
+
+    It is off, and costs nothing, while ``ent_coef`` is 0. The actions are differentiated through
+    all steps that make them.
+    """
+
+    n_entropy_actions: int
+    n_entropy_states: int
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        checks.check_at_least("n_entropy_actions", self.n_entropy_actions, 2)
+        checks.check_at_least("n_entropy_states", self.n_entropy_states, 1)
+
+    def _entropy_bonus(self, features: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """What the entropy adds to the loss, and what to log of it.
+
+        :param features: The actor's features of a minibatch in random order, (n, features_dim).
+        """
+        ent_coef = self._now(self._entropy_schedule)
+        if ent_coef == 0:
+            return features.new_zeros(()), {}
+        some = features[: self.n_entropy_states].repeat_interleave(self.n_entropy_actions, dim=0)
+        actions, _ = self.policy.sample_actions(some)
+        in_each_state = actions.reshape(-1, self.n_entropy_actions, actions.shape[-1])
+        entropy = nearest_neighbour_entropy(in_each_state)
+        return -ent_coef * entropy, {"entropy_loss": -entropy}

@@ -1,0 +1,175 @@
+"""Policies of DPPO: an action is the end of a chain of Gaussian steps."""
+
+from copy import deepcopy
+from typing import Any, ClassVar, NamedTuple
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
+from sb3_policyflow.common.checks import check_at_least, check_choice, check_positive_or_none
+from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
+
+
+class DPPORecord(NamedTuple):
+    """How an action was made, over the k steps of the chain that are trained.
+
+    Points x (n, k + 1, action_dim), the last of which is the action before its bounds, and the
+    means around which all but the first were drawn (n, k, action_dim).
+    """
+
+    points: th.Tensor
+    means: th.Tensor
+
+
+class DPPOPolicy(FlowActorCriticPolicy):
+    """Actor-critic policy that denoises an action in several steps.
+
+    x_0 ~ N(0, I),    x_{k+1} ~ N(m_k(x_k, s), max(s_k, min_sampling_std)^2 I),    a = x_K
+
+    With "ddpm", the chain's end lies in [-1, 1], which is scaled to the action space.
+
+    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
+
+    :param process: "ddpm", or "flow" for Euler steps with noise of a fixed standard deviation.
+    :param n_denoising_steps: K, steps from noise to action.
+    :param n_finetuned_steps: How many of them, the last ones, are trained; the others belong to a
+        frozen copy of the network, see :meth:`freeze_base`. All if None.
+    :param min_sampling_std: Least standard deviation of a step.
+    :param min_log_prob_std: Least standard deviation that the likelihood of a step is taken with.
+    :param noise_clip: Bound of a step's noise, in its standard deviations; None for none.
+    :param denoised_clip: Bound of the action that "ddpm" predicts in each step.
+    :param identity_skip: Whether "ddpm" adds the point to the network's output in predicting its
+        noise, which keeps untrained policies off the bounds of the actions.
+    :raises ValueError: If an option is not supported.
+    """
+
+    own_parameters: ClassVar[tuple[str, ...]] = (
+        *FlowActorCriticPolicy.own_parameters,
+        "n_denoising_steps",
+        "n_finetuned_steps",
+        "min_sampling_std",
+        "min_log_prob_std",
+        "noise_clip",
+        "denoised_clip",
+        "identity_skip",
+    )
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        *args: Any,
+        process: str = "ddpm",
+        n_denoising_steps: int = 10,
+        n_finetuned_steps: int | None = None,
+        min_sampling_std: float = 0.1,
+        min_log_prob_std: float = 0.1,
+        noise_clip: float | None = 3.0,
+        denoised_clip: float = 1.0,
+        identity_skip: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.process_name = process
+        self.n_denoising_steps = n_denoising_steps
+        self.n_finetuned_steps = n_finetuned_steps
+        self.min_sampling_std = min_sampling_std
+        self.min_log_prob_std = min_log_prob_std
+        self.noise_clip = noise_clip
+        self.denoised_clip = denoised_clip
+        self.identity_skip = identity_skip
+        self._check_options(action_space)
+        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
+        # SB3 then scales the actions from [-1, 1] to their space.
+        self._squash_output = process == "ddpm"
+
+    def _check_options(self, action_space: spaces.Space[Any]) -> None:
+        check_choice("process", self.process_name, ("ddpm", "flow"))
+        check_at_least("n_denoising_steps", self.n_denoising_steps, 1)
+        if self.n_finetuned_steps is not None:
+            check_at_least("n_finetuned_steps", self.n_finetuned_steps, 1)
+            check_at_least("n_denoising_steps", self.n_denoising_steps, self.n_finetuned_steps)
+        for name in ("min_sampling_std", "min_log_prob_std", "noise_clip", "denoised_clip"):
+            check_positive_or_none(name, getattr(self, name))
+        bounded = isinstance(action_space, spaces.Box) and action_space.is_bounded()
+        if self.process_name == "ddpm" and not bounded:
+            raise ValueError(
+                f"process='ddpm' needs an action space with finite bounds, got {action_space}: "
+                "bound the actions, or use process='flow'."
+            )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "process": self.process_name}
+
+    def _build_actor(self) -> None:
+        super()._build_actor()
+        self.process: DenoisingProcess
+        if self.process_name == "ddpm":
+            self.process = DDPM(self.n_denoising_steps, self.denoised_clip, self.identity_skip)
+        else:
+            self.process = EulerChain(self.n_denoising_steps)
+        n_trained = self.n_finetuned_steps or self.n_denoising_steps
+        self.n_frozen_steps = self.n_denoising_steps - n_trained
+        if self.n_frozen_steps > 0:
+            self.base_velocity = deepcopy(self.velocity).requires_grad_(False)
+
+    def freeze_base(self) -> None:
+        """Let the steps that are not trained use the network as it is now, say after imitation."""
+        if self.n_frozen_steps > 0:
+            self.base_velocity.load_state_dict(self.velocity.state_dict())
+
+    @property
+    def log_prob_stds(self) -> th.Tensor:
+        """Standard deviations that likelihoods of the trained steps are taken with, shape (k,)."""
+        return self.process.stds[self.n_frozen_steps :].clamp(min=self.min_log_prob_std)
+
+    def trained_means(self, points: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Means of the trained steps.
+
+        :param points: Where each step starts, shape (n, k, action_dim).
+        :param features: The actor's features, shape (n, features_dim).
+        :return: Shape (n, k, action_dim).
+        """
+        return self._means(points, slice(self.n_frozen_steps, None), features.unsqueeze(1))
+
+    def _means(self, points: th.Tensor, steps: Steps, features: th.Tensor) -> th.Tensor:
+        is_frozen = isinstance(steps, int) and steps < self.n_frozen_steps
+        network = self.base_velocity if is_frozen else self.velocity
+        return self.process.means(
+            points, network(points, self.process.times[steps], features), steps
+        )
+
+    def sample_actions(
+        self, features: th.Tensor, deterministic: bool = False
+    ) -> tuple[th.Tensor, DPPORecord]:
+        """Draw actions; the deterministic one starts at 0 and each step goes to its mean."""
+        points, means = [self.draw_latents(features, deterministic)], []
+        stds = self.process.stds.clamp(min=self.min_sampling_std)
+        for step in range(self.n_denoising_steps):
+            means.append(self._means(points[-1], step, features))
+            points.append(means[-1] if deterministic else self._noisy(means[-1], stds[step]))
+        record = DPPORecord(
+            th.stack(points[self.n_frozen_steps :], dim=1),
+            th.stack(means[self.n_frozen_steps :], dim=1),
+        )
+        return points[-1].clamp(-1, 1) if self.squash_output else points[-1], record
+
+    def _noisy(self, means: th.Tensor, std: th.Tensor) -> th.Tensor:
+        noise = th.randn_like(means)
+        if self.noise_clip is not None:
+            noise = noise.clamp(-self.noise_clip, self.noise_clip)
+        return means + std * noise
+
+
+MlpFlowPolicy = DPPOPolicy
+
+
+class CnnFlowPolicy(ImageFeatures, DPPOPolicy):
+    """:class:`DPPOPolicy` for images: its default features extractor is SB3's ``NatureCNN``."""
+
+
+class MultiInputFlowPolicy(DictFeatures, DPPOPolicy):
+    """:class:`DPPOPolicy` for Dict observations, by default with SB3's ``CombinedExtractor``."""

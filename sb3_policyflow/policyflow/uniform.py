@@ -1,0 +1,52 @@
+"""Flow matching towards uniform actions, as an entropy regulariser."""
+
+import torch as th
+from gymnasium import spaces
+
+from sb3_policyflow.flows import Path, VelocityField
+
+
+class UniformTargets:
+    """Pulls a flow towards the uniform distribution over the actions.
+
+    E ||v(x_t, t, s) - dx_t/dt||^2,    x_t between z ~ N(0, I) and u ~ U(actions),  t ~ U(0, T)
+
+    The diffusion entropy regularisation of Ding et al. (2024), "Diffusion-based Reinforcement
+    Learning via Q-weighted Variational Policy Optimization", https://arxiv.org/abs/2405.16173,
+    with flow matching in place of its noise prediction; summed over action dimensions.
+
+    :param action_space: The actions.
+    :param path: The interpolation path.
+    :raises ValueError: If there is no uniform distribution, or the path draws noise of its own.
+    """
+
+    def __init__(self, action_space: spaces.Box, path: Path) -> None:
+        if not action_space.is_bounded():
+            raise ValueError(
+                f"uniform_noise_coef needs an action space with finite bounds, got {action_space}: "
+                "set it to 0, or bound the actions."
+            )
+        if path.stochastic:
+            raise ValueError(
+                "uniform_noise_coef needs a path without noise of its own: use path='rectified' "
+                "or path='trigflow'."
+            )
+        self._path = path
+        self._low = th.as_tensor(action_space.low).flatten()
+        self._high = th.as_tensor(action_space.high).flatten()
+
+    def loss(self, velocity: VelocityField, features: th.Tensor) -> th.Tensor:
+        """The mean squared error of the velocity.
+
+        :param velocity: v, the field.
+        :param features: The actor's features, shape (n, features_dim).
+        :return: The loss, a tensor without dimensions.
+        """
+        low, high = self._low.to(features), self._high.to(features)
+        uniform = low + (high - low) * features.new_empty(len(features), len(low)).uniform_()
+        latents = th.randn_like(uniform)
+        times = self._path.end_time * features.new_empty(len(features)).uniform_()
+        points = self._path.interpolate(latents, uniform, times)
+        target = self._path.derivative(latents, uniform, times)
+        error: th.Tensor = velocity(points, times, features) - target
+        return error.square().sum(-1).mean()

@@ -1,0 +1,96 @@
+"""Registration with rl_zoo3, one function for each of its modules that this package adds to.
+
+They run when the module has been executed (see ``sb3_policyflow_startup``), and may run again.
+"""
+
+import functools
+import importlib
+import inspect
+import warnings
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.zoo.experiment import extend_experiment
+from sb3_policyflow.zoo.samplers import (
+    convert_flow_params,
+    sample_dppo_params,
+    sample_fpo_params,
+    sample_policyflow_params,
+)
+
+Hyperparams = dict[str, Any]
+
+
+class Registration(NamedTuple):
+    """An algorithm, what draws its hyperparameters in a trial, and what rebuilds them later."""
+
+    algorithm: type[BaseAlgorithm]
+    sample: Callable[..., Hyperparams]
+    convert: Callable[[Hyperparams], Hyperparams]
+
+
+ALGORITHMS = {
+    "policyflow": Registration(PolicyFlow, sample_policyflow_params, convert_flow_params),
+    "fpo": Registration(FPO, sample_fpo_params, convert_flow_params),
+    "dppo": Registration(DPPO, sample_dppo_params, convert_flow_params),
+}
+"""What ``--algo`` takes; each has its ``hyperparams/NAME.yml``."""
+
+
+def register(module: ModuleType) -> None:
+    """Add to a module of rl_zoo3 what this package has for it.
+
+    :param module: One of ``rl_zoo3.utils``, ``rl_zoo3.hyperparams_opt``, ``rl_zoo3.exp_manager``.
+    """
+    add = {
+        "rl_zoo3.utils": _add_algorithms,
+        "rl_zoo3.hyperparams_opt": _add_search_spaces,
+        "rl_zoo3.exp_manager": _extend_experiments,
+    }
+    add[module.__name__](module)
+
+
+def _add_algorithms(utils: ModuleType) -> None:
+    """Let ``--algo`` and ``--env`` know the algorithms and environments."""
+    for name, registration in ALGORITHMS.items():
+        utils.ALGOS.setdefault(name, registration.algorithm)
+    _import_robotics()
+
+
+def _import_robotics() -> None:
+    """Register gymnasium_robotics' environments, as rl_zoo3 does with the packages it knows of."""
+    try:
+        importlib.import_module("gymnasium_robotics")
+    except ModuleNotFoundError as error:
+        if error.name == "gymnasium_robotics":
+            return
+        warnings.warn(f"gymnasium_robotics' environments are missing: {error}", stacklevel=2)
+
+
+def _add_search_spaces(hyperparams_opt: ModuleType) -> None:
+    """Let ``--optimize`` and ``--trial-id`` know the search spaces."""
+    for name, registration in ALGORITHMS.items():
+        hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(name, registration.sample)
+        hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(name, registration.convert)
+
+
+def _extend_experiments(exp_manager: ModuleType) -> None:
+    """Let each new ``ExperimentManager`` go through :func:`extend_experiment`."""
+    manager_class = exp_manager.ExperimentManager
+    construct = manager_class.__init__
+    if hasattr(construct, "extended_by_sb3_policyflow"):
+        return
+    signature = inspect.signature(construct)
+
+    @functools.wraps(construct)
+    def construct_and_extend(self: Any, *args: Any, **kwargs: Any) -> None:
+        construct(self, *args, **kwargs)
+        given = signature.bind(self, *args, **kwargs).arguments
+        extend_experiment(self, own_algorithms=ALGORITHMS, config_given=bool(given.get("config")))
+
+    construct_and_extend.extended_by_sb3_policyflow = True  # type: ignore[attr-defined]
+    manager_class.__init__ = construct_and_extend

@@ -1,0 +1,33 @@
+import pytest
+
+from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
+
+RULE = KLAdaptiveLearningRate(desired_kl=0.01, bounds=(1e-4, 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("learning_rate", "kl", "expected"),
+    [
+        (6e-4, 0.0201, 4e-4),  # more than twice the target
+        (6e-4, 0.0199, 6e-4),
+        (6e-4, 0.0051, 6e-4),
+        (6e-4, 0.0049, 9e-4),  # less than half the target
+        (1.2e-4, 0.1, 1e-4),  # stops at the bounds
+        (9e-4, 0.0, 1e-3),
+    ],
+)
+def test_rule(learning_rate: float, kl: float, expected: float) -> None:
+    assert RULE.adapt(learning_rate, kl) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"desired_kl": 0.0}, "desired_kl must be positive"),
+        ({"desired_kl": 0.01, "factor": 1.0}, "lr_factor must be greater than 1"),
+        ({"desired_kl": 0.01, "bounds": (1e-2, 1e-6)}, "lr_bounds must be two positive"),
+    ],
+)
+def test_senseless_rules_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        KLAdaptiveLearningRate(**options)  # type: ignore[arg-type]

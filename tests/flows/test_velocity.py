@@ -1,0 +1,70 @@
+import math
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
+
+
+def test_time_embedding_sees_cosines_and_sines_of_its_frequencies() -> None:
+    embedding = FourierTimeEmbedding(4, frequencies=[1.0, 2.0])
+    embedding.mlp = nn.Identity()
+    time = th.tensor(0.125)
+    expected = th.tensor([math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 1.0])
+    th.testing.assert_close(embedding(time), expected, atol=1e-6, rtol=0)
+
+
+def test_frequencies_are_fixed_but_saved() -> None:
+    embedding = FourierTimeEmbedding(8, frequencies=3, frequency_scale=16.0)
+    assert "frequencies" in embedding.state_dict()
+    assert "frequencies" not in dict(embedding.named_parameters())
+    assert embedding.frequencies.shape == (3,)
+    assert len(FourierTimeEmbedding(8).frequencies) == 4  # the paper's d / 2
+
+
+def test_field_is_the_formula_of_the_paper() -> None:
+    field = VelocityField(2, 3, net_arch=[5], activation_fn=nn.SiLU, initialisation="glorot")
+    x, t, s = th.randn(7, 2), th.rand(7), th.randn(7, 3)
+    embedding = field.time_embedding(t) + field.observation_embedding(s)
+    first, last = field.hidden[0], field.output
+    assert isinstance(first, nn.Linear)
+    hidden = nn.functional.silu(th.cat([x, embedding], -1) @ first.weight.T + first.bias)
+    th.testing.assert_close(field(x, t, s), hidden @ last.weight.T + last.bias)
+
+
+def test_leading_shapes_broadcast() -> None:
+    field = VelocityField(2, 3, initialisation="glorot")
+    x, t, s = th.randn(6, 4, 2), th.rand(6, 4), th.randn(6, 1, 3)
+    together = field(x, t, s)
+    one_by_one = th.stack([field(x[:, k], t[:, k], s[:, 0]) for k in range(4)], dim=1)
+    th.testing.assert_close(together, one_by_one)
+    th.testing.assert_close(
+        field(x[:, 0], th.tensor(0.5), s[:, 0])[0], field(x[0, 0], th.tensor(0.5), s[0, 0])
+    )
+
+
+def test_initialisations() -> None:
+    x, t, s = th.randn(7, 2), th.rand(7), th.randn(7, 3)
+    fields = {
+        name: VelocityField(2, 3, initialisation=name)
+        for name in ("glorot", "glorot_zero_output", "zero")
+    }
+    assert fields["glorot"](x, t, s).abs().min() > 0
+    assert th.equal(fields["glorot_zero_output"](x, t, s), th.zeros(7, 2))
+    assert fields["glorot_zero_output"].hidden[0].weight.abs().sum() > 0  # type: ignore[operator, union-attr]
+    assert all(not parameter.any() for parameter in fields["zero"].parameters())
+    wide = VelocityField(200, 3, net_arch=[300], initialisation="glorot", embedding_dim=100)
+    weight = wide.hidden[0].weight
+    assert isinstance(weight, th.Tensor)
+    assert weight.std().item() == pytest.approx(math.sqrt(2 / (300 + 300)), rel=0.05)
+
+
+def test_unknown_initialisation_is_refused_with_the_choices() -> None:
+    with pytest.raises(ValueError, match=r"'ones'.*'glorot', 'glorot_zero_output', 'zero'"):
+        VelocityField(2, 3, initialisation="ones")
+
+
+def test_empty_embedding_is_refused() -> None:
+    with pytest.raises(ValueError, match="embedding_dim must be at least 1"):
+        VelocityField(2, 3, embedding_dim=0)

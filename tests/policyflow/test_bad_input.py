@@ -1,0 +1,90 @@
+"""What cannot work is refused with a sentence, before training."""
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_policyflow import PolicyFlow
+
+SMALL = {"n_steps": 16, "batch_size": 8}
+
+
+@pytest.mark.parametrize(
+    "space",
+    [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(4)],
+    ids=lambda space: type(space).__name__,
+)
+def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
+    with pytest.raises(ValueError, match=r"need continuous actions.*use PPO of stable_baselines3"):
+        PolicyFlow("MlpPolicy", IdentityEnv(space=space), **SMALL)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"use_sde": True}, r"use_sde=True is not supported: leave it out"),
+        ({"rollout_buffer_class": RolloutBuffer}, r"needs a rollout buffer that keeps.*derive"),
+        ({"n_flow_steps": 0}, r"at least one solver step"),
+        ({"path": "straight"}, r"Unknown path 'straight': choose one of 'rectified', 'stochastic'"),
+        ({"solver": "dopri5"}, r"Unknown solver 'dopri5': choose one of 'euler', 'midpoint'"),
+        ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'starts', 'uniform'"),
+        ({"n_times": 0}, r"n_times must be at least 1"),
+        ({"time_average": "ratio"}, r"time_average must be one of 'objective', 'shift'"),
+        ({"brownian_coef": -0.1}, r"brownian_coef must not be negative"),
+        ({"ent_coef": -0.1}, r"ent_coef must not be negative"),
+        ({"brownian_coef": "linear"}, r"brownian_coef must be a number"),
+        ({"brownian_reduction": "max"}, r"brownian_reduction must be one of 'sum', 'mean'"),
+        ({"desired_kl": 0.0}, r"desired_kl must be positive or None"),
+        ({"lr_adaptation": "step"}, r"lr_adaptation must be one of 'epoch', 'minibatch'"),
+        ({"kl_window": "all"}, r"kl_window must be one of 'epoch', 'update'"),
+        ({"advantage_scope": "all"}, r"advantage_scope must be one of 'minibatch', 'rollout'"),
+        ({"timeout_bootstrap": "yes"}, r"timeout_bootstrap must be one of 'terminal', 'current'"),
+        ({"batch_size": 1}, r"batch_size must be at least 2"),
+        ({"n_steps": 0}, r"n_steps must be at least 1"),
+        ({"n_epochs": 0}, r"n_epochs must be at least 1"),
+        ({"clip_range_vf": -0.2}, r"clip_range_vf must be positive, or None"),
+        ({"policy_kwargs": {"initialisation": "he"}}, r"Unknown initialisation 'he'"),
+        ({"policy_kwargs": {"embedding_dim": 0}}, r"embedding_dim must be at least 1"),
+        ({"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to PolicyFlow itself"),
+    ],
+    ids=str,
+)
+def test_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PolicyFlow("MlpFlowPolicy", "Pendulum-v1", **{**SMALL, **options})
+
+
+def test_options_that_do_not_exist_are_not_swallowed() -> None:
+    with pytest.raises(TypeError, match="brownian"):
+        PolicyFlow("MlpFlowPolicy", "Pendulum-v1", brownian=0.1)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="full_std"):
+        PolicyFlow("MlpFlowPolicy", "Pendulum-v1", policy_kwargs={"full_std": True})
+
+
+def test_policies_of_another_kind() -> None:
+    with pytest.raises(ValueError, match=r"derived from FlowPolicy, not ActorCriticPolicy: use"):
+        PolicyFlow(ActorCriticPolicy, "Pendulum-v1")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="GaussianPolicy"):
+        PolicyFlow("GaussianPolicy", "Pendulum-v1")
+
+
+def test_flat_policy_for_dict_observations() -> None:
+    with pytest.raises(ValueError, match="MultiInputPolicy"):
+        PolicyFlow("MlpPolicy", SimpleMultiObsEnv(discrete_actions=False))
+
+
+def test_truncated_minibatches_are_announced() -> None:
+    with pytest.warns(UserWarning, match="last minibatch of each epoch will have 4 samples"):
+        PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=20, batch_size=8)
+
+
+def test_likelihoods_are_refused() -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL)  # type: ignore[arg-type]
+    obs, _ = model.policy.obs_to_tensor(gym.make("Pendulum-v1").reset()[0])
+    with pytest.raises(TypeError, match="no closed-form likelihood"):
+        model.policy.evaluate_actions(obs, obs)

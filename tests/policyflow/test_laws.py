@@ -1,0 +1,210 @@
+"""Laws of PolicyFlow's objective, in float64."""
+
+from typing import Any
+
+import pytest
+import torch as th
+from torch import nn
+from torch.distributions import Independent, Normal
+
+from sb3_policyflow import PolicyFlow
+from sb3_policyflow.common.losses import clipped_surrogate
+from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
+from sb3_policyflow.policyflow.behaviour import Behaviour
+from sb3_policyflow.policyflow.policies import PolicyFlowRecord
+from sb3_policyflow.policyflow.policyflow import Probes
+
+N_SAMPLES = 16
+
+
+def tiny_model(**options: Any) -> PolicyFlow:
+    """A PolicyFlow in float64 whose velocity is not zero."""
+    policy_kwargs = {
+        "net_arch": {"pi": [4], "vf": [4]},
+        "embedding_dim": 4,
+        "initialisation": "glorot",
+        "activation_fn": nn.SiLU,
+        **options.pop("policy_kwargs", {}),
+    }
+    model = PolicyFlow(
+        "MlpFlowPolicy",
+        "Pendulum-v1",
+        n_steps=N_SAMPLES,
+        batch_size=N_SAMPLES,
+        seed=0,
+        policy_kwargs=policy_kwargs,
+        **options,
+    )
+    model.policy.double()
+    model._setup_schedules()
+    return model
+
+
+def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor, Behaviour]:
+    """A batch sampled from the model's policy, its features and the behaviour."""
+    features = th.randn(N_SAMPLES, 3, dtype=th.float64)
+    with th.no_grad():
+        actions, record = model.policy.sample_actions(features)
+    batch = FlowRolloutBufferSamples(
+        observations=features,
+        actions=actions,
+        old_values=th.zeros(N_SAMPLES, dtype=th.float64),
+        advantages=th.randn(N_SAMPLES, dtype=th.float64),
+        returns=th.randn(N_SAMPLES, dtype=th.float64),
+        record=record,
+    )
+    behaviour = Behaviour.__new__(Behaviour)
+    # SB3 casts observations to float32; features are what the policy's float64 part begins with.
+    behaviour._extract = lambda policy, observations: observations  # type: ignore[method-assign]
+    behaviour.__init__(model.policy, features)  # type: ignore[misc]
+    return batch._replace(probes=model._draw_probes(batch, behaviour)), features, behaviour
+
+
+def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter += scale * th.randn_like(parameter)
+
+
+@pytest.mark.parametrize("path", ["rectified", "stochastic", "trigflow"])
+@pytest.mark.parametrize("n_times", [1, 3])
+def test_nothing_has_changed_before_the_first_step(path: str, n_times: int) -> None:
+    model = tiny_model(path=path, n_times=n_times)
+    batch, features, behaviour = sample_batch(model)
+    terms = model._policy_terms(batch, features, behaviour)
+    assert th.equal(terms.log_ratio, th.zeros(N_SAMPLES, n_times, dtype=th.float64))
+    assert terms.kl.item() == 0.0
+    assert terms.metrics["velocity_change"].item() == 0.0
+
+
+def test_ratio_is_that_of_the_shifted_gaussian() -> None:
+    model = tiny_model()
+    batch, features, behaviour = sample_batch(model)
+    perturb(model)
+    terms = model._policy_terms(batch, features, behaviour)
+    probes: Probes = batch.probes
+    with th.no_grad():
+        new_velocity = model.policy.velocity(probes.points[:, 0], probes.times[:, 0], features)
+        change = new_velocity - probes.old_velocity[:, 0]
+        noise = batch.actions - batch.record.endpoints
+        new = Independent(Normal(change, model.policy.log_std.exp()), 1).log_prob(noise)
+        old = Independent(Normal(th.zeros_like(noise), behaviour.log_std.exp()), 1).log_prob(noise)
+    th.testing.assert_close(terms.log_ratio[:, 0], new - old)
+    assert terms.log_ratio.abs().min() > 0
+
+
+def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
+    """A velocity that grows by a constant moves the end point by (pi/2) times it, exactly."""
+    model = tiny_model(path="trigflow", time_average="shift", n_times=2, n_flow_steps=5)
+    batch, features, behaviour = sample_batch(model)
+    change = th.tensor([0.01], dtype=th.float64)
+    with th.no_grad():
+        model.policy.velocity.output.weight.zero_()
+        before = model.policy.carry(batch.record.latents, features)
+        behaviour = Behaviour.__new__(Behaviour)
+        behaviour._extract = lambda policy, observations: observations  # type: ignore[method-assign]
+        behaviour.__init__(model.policy, features)  # type: ignore[misc]
+        probes = model._draw_probes(batch, behaviour)
+        model.policy.velocity.output.bias += change
+        true_shift = model.policy.carry(batch.record.latents, features) - before
+    terms = model._policy_terms(batch._replace(probes=probes), features, behaviour)
+    noise = batch.actions - batch.record.endpoints
+    log_std = model.policy.log_std
+    new = Independent(Normal(true_shift, log_std.exp()), 1).log_prob(noise)
+    old = Independent(Normal(th.zeros_like(noise), log_std.exp()), 1).log_prob(noise)
+    th.testing.assert_close(terms.log_ratio[:, 0], new - old)
+
+
+def test_equals_gaussian_ppo_when_the_old_velocity_and_the_latents_are_zero() -> None:
+    """With z = phi = 0 and v_old = 0 the new velocity is the mean of PPO's Gaussian."""
+    model = tiny_model(policy_kwargs={"initialisation": "glorot_zero_output"}, ent_coef=0.01)
+    batch, features, behaviour = sample_batch(model)
+    zeros = th.zeros_like(batch.actions)
+    batch = batch._replace(record=PolicyFlowRecord(zeros, zeros), actions=th.randn_like(zeros))
+    batch = batch._replace(probes=model._draw_probes(batch, behaviour))
+    perturb(model)
+    advantages, parameters = batch.advantages, actor_parameters(model)
+
+    terms = model._policy_terms(batch, features, behaviour)
+    ours = -clipped_surrogate(terms.log_ratio[:, 0], advantages, 0.2).mean() + terms.regulariser
+
+    means = model.policy.velocity(zeros, batch.probes.times[:, 0], features)
+    gaussian = Independent(Normal(means, model.policy.log_std.exp()), 1)
+    standard = Independent(Normal(zeros, th.ones_like(zeros)), 1)
+    ratio = (gaussian.log_prob(batch.actions) - standard.log_prob(batch.actions)).exp()
+    objective = th.min(ratio * advantages, ratio.clamp(0.8, 1.2) * advantages)
+    theirs = -objective.mean() - 0.01 * gaussian.entropy().mean()
+
+    th.testing.assert_close(ours, theirs)
+    for our_gradient, their_gradient in zip(
+        th.autograd.grad(ours, parameters), th.autograd.grad(theirs, parameters), strict=True
+    ):
+        th.testing.assert_close(our_gradient, their_gradient)
+
+
+def actor_parameters(model: PolicyFlow) -> list[nn.Parameter]:
+    return [*model.policy.velocity.parameters(), model.policy.log_std]
+
+
+@pytest.mark.parametrize("path", ["rectified", "stochastic", "trigflow"])
+def test_gradient_equals_finite_differences_for_every_parameter(path: str) -> None:
+    model = tiny_model(path=path, brownian_coef=0.25, ent_coef=0.01, n_times=2)
+    batch, features, behaviour = sample_batch(model)
+    perturb(model, 0.02)
+
+    def loss() -> th.Tensor:
+        terms = model._policy_terms(batch, features, behaviour)
+        objective = clipped_surrogate(terms.log_ratio, batch.advantages.unsqueeze(1), 0.2)
+        return -objective.mean() + terms.regulariser
+
+    parameters = actor_parameters(model)
+    gradients = th.autograd.grad(loss(), parameters)
+    assert sum(parameter.numel() for parameter in parameters) > 60
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        th.testing.assert_close(gradient, finite_differences(loss, parameter), atol=1e-7, rtol=1e-5)
+
+
+def finite_differences(loss: Any, parameter: th.Tensor, step: float = 1e-6) -> th.Tensor:
+    slopes = th.zeros_like(parameter)
+    flat, flat_slopes = parameter.detach().view(-1), slopes.view(-1)
+    for index in range(len(flat)):
+        centre = flat[index].item()
+        values = []
+        for sign in (1, -1):
+            flat[index] = centre + sign * step
+            values.append(loss().item())
+        flat[index] = centre
+        flat_slopes[index] = (values[0] - values[1]) / (2 * step)
+    return slopes
+
+
+def test_brownian_loss_by_hand() -> None:
+    """Straight path at t = 1/2 with x = (3, 1), v_old = (2, 0), v = (4, 2): eta = (0, 0)."""
+    model = tiny_model()
+    probes = Probes(
+        times=th.tensor([[0.5]]),
+        points=th.tensor([[[3.0, 1.0]]]),
+        old_velocity=th.tensor([[[2.0, 0.0]]]),
+    )
+    assert model._brownian_loss(probes, th.tensor([[[4.0, 2.0]]])).item() == 0.0
+    # v = (8, 2): eta = (2, 0); the squared norm is 4, its mean over dimensions 2.
+    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 4.0
+    model.brownian_reduction = "mean"
+    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 2.0
+
+
+def test_approximate_ratio_approaches_the_exact_one_for_small_updates() -> None:
+    """The error of the shift is of first order in the update (paper, error analysis)."""
+    errors = []
+    for scale in (0.02, 0.01):
+        model = tiny_model(n_times=64, time_average="shift")
+        batch, features, _ = sample_batch(model)
+        th.manual_seed(5)
+        perturb(model, scale)
+        with th.no_grad():
+            probes: Probes = batch.probes
+            new = model.policy.velocity(probes.points, probes.times, features.unsqueeze(1))
+            approximate = (new - probes.old_velocity).mean(1)
+            exact = model.policy.carry(batch.record.latents, features) - batch.record.endpoints
+        errors.append((approximate - exact).norm().item())
+    assert errors[1] < 0.7 * errors[0]
