@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.aliases import flow_policy_aliases
+from sb3_policyflow.common.chunks import in_chunks
 from sb3_policyflow.common.losses import (
     gaussian_entropy,
     gaussian_kl,
@@ -213,7 +214,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
 
     def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Behaviour:
         """The policy before the update, theta-hat and sigma-hat."""
-        return Behaviour(self.policy, rollout.observations)
+        features = in_chunks(self.policy.actor_features, rollout.observations)
+        return Behaviour(self.policy, features)
 
     def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Behaviour) -> Probes:
         """Draw t for each sample and look up the old velocity at x_t."""
