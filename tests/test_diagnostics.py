@@ -15,8 +15,13 @@ from sb3_policyflow.diagnostics import FlowDiagnosticsCallback, end_point_shifts
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.fpo import FPO
 
-SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 128, "n_epochs": 2, "seed": 0, "n_flow_steps": 4}
-RATIO = ("log_ratio_correlation", "log_ratio_error", "shift_exact", "shift_cosine", "kl_exact")
+SMALL: dict[str, Any] = {
+    "n_steps": 32,
+    "batch_size": 128,
+    "n_epochs": 2,
+    "n_flow_steps": 4,
+    "seed": 0,
+}
 
 
 class Collector(BaseCallback):
