@@ -1,10 +1,10 @@
 """Networks evaluated and differentiated by kernels."""
 
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from torch.autograd.function import once_differentiable
 
 from sb3_policyflow.fused.compiler import kernels
 from sb3_policyflow.fused.networks import Activation, Perceptron, in_memory
@@ -25,109 +25,146 @@ class FirstLayer(NamedTuple):
     shifts: th.Tensor
 
 
-def evaluate(first: FirstLayer, network: Perceptron) -> th.Tensor:
-    """Outputs (n, n_outputs) of a network whose first layer is given; differentiable."""
-    others = [tensor for layer in network.layers[1:] for tensor in layer]
-    outputs: th.Tensor = _Evaluation.apply(network.activation, *first, *others)
-    return outputs
+class Gradients(NamedTuple):
+    """Gradients with respect to a first layer, without its index, and to the layers behind it."""
+
+    inputs: th.Tensor | None
+    weight: th.Tensor
+    table: th.Tensor
+    shifts: th.Tensor
+    others: list[th.Tensor]
+
+
+class Pass:
+    """One evaluation of a network, and the way back.
+
+    :param activation: The network's activation.
+    :param first: Its first layer, evaluated.
+    :param others: Weight and bias of each layer behind it.
+    :param keeps: Whether to keep what the way back needs.
+    """
+
+    def __init__(
+        self, activation: Activation, first: FirstLayer, others: list[th.Tensor], keeps: bool
+    ) -> None:
+        self._weight = first.weight.T.contiguous()
+        weights = others[::2]
+        self._widths = np.array([weight.shape[1] for weight in weights])
+        n_rows, n_kept = len(first.inputs), int(self._widths.sum())
+        work = self._weight.numel() + sum(weight.numel() for weight in weights)
+        self._parts = n_parts(n_rows, work)
+        self.kept = first.inputs.new_empty(2, n_rows * n_kept if keeps else 0)
+        self.outputs = first.inputs.new_empty(n_rows, len(others[-1]))
+        module: Any = kernels()
+        arguments = (
+            first.inputs.numpy(),
+            self._weight.numpy(),
+            first.table.numpy(),
+            first.index.numpy(),
+            first.shifts.numpy(),
+            _addresses(others),
+            self._widths,
+            others[-2].numpy(),
+            others[-1].numpy(),
+            getattr(module, activation.name),
+            activation.alpha,
+            self.outputs.numpy(),
+            *self.kept.numpy(),
+        )
+        run = module.forward
+        in_parts(n_rows, self._parts, lambda _, start, stop: run(*arguments, start, stop))
+
+    def back(
+        self,
+        first: FirstLayer,
+        others: list[th.Tensor],
+        grad_outputs: th.Tensor,
+        needs_inputs: bool = False,
+    ) -> Gradients:
+        """The gradients of what has these gradients with respect to the outputs.
+
+        :param first: The first layer again.
+        :param others: The layers behind it again.
+        :param grad_outputs: Shape (n, n_outputs).
+        :param needs_inputs: Whether gradients with respect to the inputs are wanted.
+        """
+        inputs, shifts = first.inputs, first.shifts
+        tensors = (self._weight, first.table, *others)
+        sizes = [tensor.numel() for tensor in tensors]
+        grads = inputs.new_zeros(self._parts, sum(sizes))
+        grad_shifts = th.zeros_like(shifts)
+        grad_inputs = th.empty_like(inputs if needs_inputs else inputs[:0])
+        before = (
+            inputs.numpy(),
+            self._weight.numpy(),
+            first.index.numpy(),
+            _addresses(others),
+            self._widths,
+            others[-2].numpy(),
+            *self.kept.numpy(),
+            grad_outputs.contiguous().numpy(),
+        )
+        after = (len(first.table), grad_shifts.numpy(), grad_inputs.numpy())
+        group = len(inputs) // len(shifts) if len(shifts) else 1
+        flat, run = grads.numpy(), kernels().backward  # type: ignore[union-attr]
+        in_parts(
+            len(inputs) // group,
+            self._parts,
+            lambda part, start, stop: run(*before, flat[part], *after, start * group, stop * group),
+        )
+        total = grads[0] if self._parts == 1 else grads.sum(0)
+        weight, table, *rest = (
+            grad.view_as(tensor) for grad, tensor in zip(total.split(sizes), tensors, strict=True)
+        )
+        return Gradients(grad_inputs if needs_inputs else None, weight.T, table, grad_shifts, rest)
+
+
+def _addresses(others: list[th.Tensor]) -> Any:
+    """Where the parameters are of the layers between the first and the output."""
+    return np.array([tensor.data_ptr() for tensor in others[:-2]], dtype=np.int64)
+
+
+class _PerceptronEvaluation(th.autograd.Function):
+    """A perceptron as a node of autograd's graph."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, activation: Activation, inputs: th.Tensor, *parameters: th.Tensor
+    ) -> th.Tensor:
+        keeps = any(ctx.needs_input_grad)
+        ctx.way = Pass(
+            activation, _own_first_layer(inputs, parameters), list(parameters[2:]), keeps
+        )
+        if keeps:
+            ctx.save_for_backward(inputs, *parameters)
+        outputs: th.Tensor = ctx.way.outputs
+        return outputs
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
+        inputs, *parameters = ctx.saved_tensors
+        first = _own_first_layer(inputs, parameters)
+        grads = ctx.way.back(first, parameters[2:], grad_outputs, ctx.needs_input_grad[1])
+        return (
+            None,
+            grads.inputs,
+            grads.weight.contiguous(),
+            grads.table.view(-1),
+            *grads.others,
+        )
+
+
+def _own_first_layer(inputs: th.Tensor, parameters: Any) -> FirstLayer:
+    weight, bias = parameters[:2]
+    index = inputs.new_zeros(len(inputs), dtype=th.int64)
+    return FirstLayer(inputs, weight, bias.view(1, -1), index, bias.new_empty(0, len(bias)))
 
 
 def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | None:
     """Outputs (n, n_outputs) for inputs (n, n_inputs), or None where kernels cannot work."""
-    tensors = [tensor for layer in network.layers for tensor in layer]
-    if kernels() is None or not in_memory((inputs, *tensors)):
+    parameters = [tensor for layer in network.layers for tensor in layer]
+    if kernels() is None or inputs.dim() != 2 or not in_memory((inputs, *parameters)):
         return None
-    weight, bias = network.layers[0]
-    index = th.zeros(len(inputs), dtype=th.int64)
-    no_shifts = bias.new_empty(0, len(bias))
-    return evaluate(FirstLayer(inputs, weight, bias.unsqueeze(0), index, no_shifts), network)
-
-
-class _Evaluation(th.autograd.Function):
-    """A network of kernels that keeps activations and their slopes for its gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, activation: Activation, *tensors: th.Tensor) -> th.Tensor:  # type: ignore[override]
-        first, others = FirstLayer(*tensors[:5]), tensors[5:]
-        layout = _Layout(first, others)
-        n_rows = len(first.inputs)
-        outputs = first.inputs.new_empty(n_rows, layout.n_outputs)
-        keeps = any(ctx.needs_input_grad)
-        kept = first.inputs.new_empty(2, n_rows * layout.total if keeps else 0)
-        transposed = first.weight.T.contiguous()
-        arguments = (
-            first.inputs.numpy(),
-            transposed.numpy(),
-            first.table.numpy(),
-            first.index.numpy(),
-            first.shifts.numpy(),
-            layout.addresses,
-            layout.widths,
-            others[-2].numpy(),
-            others[-1].numpy(),
-            getattr(kernels(), activation.name),
-            activation.alpha,
-            outputs.numpy(),
-            *kept.numpy(),
-        )
-        run = kernels().forward
-        in_parts(n_rows, layout.parts, lambda _, start, stop: run(*arguments, start, stop))
-        if keeps:
-            ctx.save_for_backward(transposed, kept, *tensors)
-        return outputs
-
-    @staticmethod
-    def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:  # type: ignore[override]
-        transposed, kept, *tensors = ctx.saved_tensors
-        first, others = FirstLayer(*tensors[:5]), tensors[5:]
-        layout = _Layout(first, others)
-        needs_inputs = ctx.needs_input_grad[1]
-        sizes = [first.weight.numel(), first.table.numel(), *(t.numel() for t in others)]
-        grads = first.inputs.new_zeros(layout.parts, sum(sizes))
-        grad_shifts = th.zeros_like(first.shifts)
-        grad_inputs = th.empty_like(first.inputs if needs_inputs else first.inputs[:0])
-        before = (
-            first.inputs.numpy(),
-            transposed.numpy(),
-            first.index.numpy(),
-            layout.addresses,
-            layout.widths,
-            others[-2].numpy(),
-            *kept.numpy(),
-            grad_outputs.contiguous().numpy(),
-        )
-        flat = grads.numpy()
-        after = (len(first.table), grad_shifts.numpy(), grad_inputs.numpy())
-        run = kernels().backward
-        group = layout.group
-        in_parts(
-            len(first.inputs) // group,
-            layout.parts,
-            lambda part, start, stop: run(*before, flat[part], *after, start * group, stop * group),
-        )
-        total = grads[0] if layout.parts == 1 else grads.sum(0)
-        grad_weight, grad_table, *grad_others = total.split(sizes)
-        return (
-            None,
-            grad_inputs if needs_inputs else None,
-            grad_weight.view_as(transposed).T,
-            grad_table.view_as(first.table),
-            None,
-            grad_shifts,
-            *(grad.view_as(tensor) for grad, tensor in zip(grad_others, others, strict=True)),
-        )
-
-
-class _Layout:
-    """Where the kernels find the layers, and what they cost."""
-
-    def __init__(self, first: FirstLayer, others: Iterable[th.Tensor]) -> None:
-        others = list(others)
-        weights = others[::2]
-        self.widths = np.array([weight.shape[1] for weight in weights])
-        self.addresses = np.array([tensor.data_ptr() for tensor in others[:-2]], dtype=np.int64)
-        self.n_outputs = len(others[-1])
-        self.total = sum(weight.shape[1] for weight in weights)
-        work = first.weight.numel() + sum(weight.numel() for weight in weights)
-        self.parts = n_parts(len(first.inputs), work)
-        self.group = len(first.inputs) // max(len(first.shifts), 1) if len(first.shifts) else 1
+    outputs: th.Tensor = _PerceptronEvaluation.apply(network.activation, inputs, *parameters)
+    return outputs
