@@ -1,32 +1,19 @@
 """The flow from latent to end point in one call of a kernel."""
 
-from collections.abc import Iterable, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from torch import nn
 
-from sb3_policyflow.flows import (
-    SOLVERS,
-    FourierTimeEmbedding,
-    Solver,
-    VelocityField,
-    integrate,
-)
+from sb3_policyflow.flows import SOLVERS, Solver, VelocityField, integrate
 from sb3_policyflow.flows.folding import fold, integrate_folded
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
-from sb3_policyflow.fused.compiler import kernels, note_fallback
-from sb3_policyflow.fused.networks import (
-    Perceptron,
-    is_plain,
-    is_served,
-    linear_parameters,
-    read_perceptron,
-)
-from sb3_policyflow.fused.threads import in_parts
+from sb3_policyflow.fused.compiler import kernels
+from sb3_policyflow.fused.fields import FieldParts, FusedVelocityField
+from sb3_policyflow.fused.networks import in_memory
+from sb3_policyflow.fused.threads import in_parts, n_parts
 
 Array = NDArray[Any]
 
@@ -38,18 +25,22 @@ class Snapshot:
     """
 
     def __init__(self) -> None:
-        self._copy = np.zeros(0, dtype=np.int32)
+        self._places: list[int] = []
 
     def renew(self, tensors: Sequence[th.Tensor]) -> bool:
         """Copy the tensors, and say whether the copy was out of date."""
-        sizes = [tensor.numel() for tensor in tensors]
-        is_new = len(self._copy) != sum(sizes)
-        if is_new:
-            self._copy = np.zeros(sum(sizes), dtype=np.int32)
-        addresses = [tensor.data_ptr() for tensor in tensors]
+        places = [tensor.data_ptr() for tensor in tensors]
+        if places != self._places:
+            sizes = [tensor.numel() for tensor in tensors]
+            self._places = places
+            self._arguments = (
+                np.array(places),
+                np.array(sizes),
+                np.full(sum(sizes), -1, dtype=np.int32),
+            )
         module: Any = kernels()
-        changed: bool = module.renew(np.array(addresses), np.array(sizes), self._copy)
-        return changed or is_new
+        changed: bool = module.renew(*self._arguments)
+        return changed
 
 
 class FlowSampler:
@@ -64,10 +55,18 @@ class FlowSampler:
     """
 
     def __init__(self, solver: str, n_steps: int, end_time: float) -> None:
-        self._solver, self._n_steps, self._end_time = solver, n_steps, end_time
-        self._times = solver_times(solver, n_steps, end_time).float()
+        self._options: dict[str, Any] = {
+            "solver": solver,
+            "n_steps": n_steps,
+            "end_time": end_time,
+        }
+        self._times = solver_times(**self._options).float()
         self._stages, self._tableau = _tableau(SOLVERS[solver], n_steps, end_time)
         self._snapshot = Snapshot()
+
+    def __reduce__(self) -> Any:
+        # A copy derives what it needs from the weights that it finds.
+        return type(self), tuple(self._options[name] for name in ("solver", "n_steps", "end_time"))
 
     def carry(self, field: VelocityField, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
         """End points of the flow.
@@ -77,94 +76,52 @@ class FlowSampler:
         :param features: s, shape (n, features_dim).
         :return: phi, shape (n, dim).
         """
-        endpoints = None if th.is_grad_enabled() else self._fused(field, latents, features)
-        if endpoints is not None:
-            return endpoints
-        options = {"n_steps": self._n_steps, "solver": self._solver, "end_time": self._end_time}
-        if is_foldable(field):
-            return integrate_folded(field, latents, features, **options)
-        return integrate(lambda points, time: field(points, time, features), latents, **options)
+        parts = field.parts() if type(field) is FusedVelocityField else None
+        if parts is not None and not th.is_grad_enabled() and in_memory((latents, features)):
+            return self._fused(field, parts, latents, features)
+        if type(field) in (VelocityField, FusedVelocityField):
+            return integrate_folded(field, latents, features, **self._options)
+        return integrate(
+            lambda points, time: field(points, time, features), latents, **self._options
+        )
 
     def _fused(
-        self, field: VelocityField, latents: th.Tensor, features: th.Tensor
-    ) -> th.Tensor | None:
-        """End points by a kernel, or None if it does not serve the field or the tensors."""
-        module, network = kernels(), read_field(field)
-        if module is None or network is None:
-            return None
-        tensors, perceptron = network
-        if not is_served(latents, features, *tensors):
-            note_fallback("some tensors are not contiguous float32 in memory")
-            return None
-        if self._snapshot.renew(tensors):
-            self._weights, self._widths, self._table = _arrange(field, perceptron, self._times)
+        self, field: VelocityField, parts: FieldParts, latents: th.Tensor, features: th.Tensor
+    ) -> th.Tensor:
+        module: Any = kernels()
+        if self._snapshot.renew(parts.tensors):
+            self._network, self._method = self._derive(field, parts)
+            self._work = self._stages.size * sum(
+                t.numel() for layer in parts.network.layers for t in layer
+            )
         endpoints = th.empty_like(latents)
-        kind = getattr(module, perceptron.activation.name)
-        arguments = (
-            self._weights,
-            self._widths,
-            kind,
-            perceptron.activation.alpha,
-            self._table,
-            self._stages,
-            self._tableau,
-            features.detach().numpy(),
-            latents.detach().numpy(),
-            endpoints.numpy(),
-        )
+        arrays = (features.detach().numpy(), latents.detach().numpy(), endpoints.numpy())
         in_parts(
             len(latents),
-            self._stages.size * len(self._weights),
-            lambda start, stop: module.flow(*arguments, start, stop),
+            n_parts(len(latents), self._work),
+            lambda _, start, stop: module.flow(self._network, self._method, *arrays, start, stop),
         )
         return endpoints
 
-
-def read_field(field: VelocityField) -> tuple[list[th.Tensor], Perceptron] | None:
-    """All that a field's velocity depends on, and its MLP; None if it is not of the kind served."""
-    embedding = field.time_embedding
-    perceptron = read_perceptron(chain(_children(field.hidden), (field.output,)))
-    observation = linear_parameters(field.observation_embedding)
-    time = read_perceptron(_children(embedding.mlp))
-    is_known = type(field) is VelocityField and type(embedding) is FourierTimeEmbedding
-    containers = (field, field.hidden, embedding, embedding.mlp)
-    if (
-        not (is_known and all(map(is_plain, containers)))
-        or perceptron is None
-        or len(perceptron.parameters) < 2
-        or observation is None
-        or time is None
-    ):
-        note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
-        return None
-    layers = chain(time.parameters, (observation,), perceptron.parameters)
-    return [embedding.frequencies, *chain.from_iterable(layers)], perceptron
-
-
-def is_foldable(field: VelocityField) -> bool:
-    """Whether the first layer of a field is nothing but linear, as folding it supposes."""
-    folded = (field.layers[0], field.observation_embedding)
-    has_known_layers = all(linear_parameters(layer) is not None for layer in folded)
-    return type(field) is VelocityField and has_known_layers and is_plain(field)
-
-
-def _children(module: nn.Module) -> Iterable[nn.Module]:
-    return module._modules.values()  # type: ignore[return-value]  # none of ours is None
-
-
-def _arrange(
-    field: VelocityField, perceptron: Perceptron, times: th.Tensor
-) -> tuple[Array, Array, Array]:
-    """Weights, widths and table as the kernel takes them."""
-    with th.no_grad():
-        first = fold(field, times)
-        parts = [first.points.T, first.features.T]
-        for weight, bias in perceptron.parameters[1:-1]:
-            parts += [weight.T, bias]
-        parts += perceptron.parameters[-1]
-        weights = th.cat([part.reshape(-1) for part in parts])
-    widths = [len(bias) for _, bias in perceptron.parameters[:-1]]
-    return weights.numpy(), np.array(widths), first.table.numpy()
+    @th.no_grad()
+    def _derive(self, field: VelocityField, parts: FieldParts) -> tuple[Any, Any]:
+        """Network and method as the kernel takes them."""
+        module: Any = kernels()
+        first, activation = fold(field, self._times), parts.network.activation
+        between = [t for weight, bias in parts.network.layers[1:-1] for t in (weight.T, bias)]
+        output = parts.network.layers[-1]
+        hidden = [part.reshape(-1) for part in between]
+        network = module.Network(
+            points=first.points.T.contiguous().numpy(),
+            features=first.features.T.contiguous().numpy(),
+            hidden=(th.cat(hidden) if hidden else th.zeros(0)).numpy(),
+            widths=np.array([len(layer.bias) for layer in parts.network.layers[:-1]]),
+            output=output.weight.numpy().copy(),
+            bias=output.bias.numpy().copy(),
+            kind=getattr(module, activation.name),
+            alpha=np.float32(activation.alpha),
+        )
+        return network, module.Method(first.table.numpy(), self._stages, self._tableau)
 
 
 def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Array, Array]:

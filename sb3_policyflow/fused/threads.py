@@ -7,24 +7,29 @@ from functools import cache
 
 import torch as th
 
-WORTHWHILE = 2_000_000
+WORTHWHILE = 4_000_000
 """Multiplications for which it pays to wake another thread."""
 
 
-def in_parts(n_rows: int, work_per_row: int, run: Callable[[int, int], None]) -> None:
-    """Call ``run(start, stop)`` for parts of the rows, on as many threads as torch may use.
+def n_parts(n_rows: int, work_per_row: int) -> int:
+    """In how many parts to do some work.
 
     :param n_rows: How many rows there are.
     :param work_per_row: Multiplications for each.
-    :param run: Works on some of the rows, without Python's global lock.
     """
-    n_parts = min(th.get_num_threads(), n_rows * work_per_row // WORTHWHILE, n_rows)
-    if n_parts < 2:
-        run(0, n_rows)
-        return
-    bounds = [n_rows * part // n_parts for part in range(n_parts + 1)]
-    others = [_pool().submit(run, *bounds[part : part + 2]) for part in range(1, n_parts)]
-    run(*bounds[:2])
+    return max(1, min(th.get_num_threads(), n_rows * work_per_row // WORTHWHILE, n_rows))
+
+
+def in_parts(n_rows: int, parts: int, run: Callable[[int, int, int], None]) -> None:
+    """Call ``run(part, start, stop)`` for parts of the rows, each on a thread of its own.
+
+    :param n_rows: How many rows there are.
+    :param parts: In how many parts.
+    :param run: Works on some of the rows, for the most part without Python's global lock.
+    """
+    bounds = [n_rows * part // parts for part in range(parts + 1)]
+    others = [_pool().submit(run, part, *bounds[part : part + 2]) for part in range(1, parts)]
+    run(0, *bounds[:2])
     for other in others:
         other.result()
 
