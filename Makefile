@@ -20,7 +20,7 @@ lint: $(VENV)/tests-installed
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/tests-installed
-	$(BIN)/mypy sb3_policyflow sb3_policyflow_startup.py
+	$(BIN)/mypy sb3_policyflow
 
 docs: $(VENV)/docs-installed
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

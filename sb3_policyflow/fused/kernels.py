@@ -7,7 +7,6 @@ this module through :func:`sb3_policyflow.fused.compiler.kernels`.
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba import carray, njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray

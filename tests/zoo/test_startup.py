@@ -1,13 +1,12 @@
 """The startup finder, in interpreters of environments that have the package installed."""
 
-import pkgutil
 import shutil
 from pathlib import Path
 
 import pytest
 from installation import REPOSITORY, Environment, build
 
-import sb3_policyflow_startup
+from sb3_policyflow.startup import sb3_policyflow_startup
 
 ALGORITHMS = "import rl_zoo3.utils; print('policyflow' in rl_zoo3.utils.ALGOS)"
 FINDERS = "import sys; print([type(f).__name__ for f in sys.meta_path].count('ZooFinder'))"
@@ -172,10 +171,9 @@ def test_uninstalling_leaves_nothing(environment: Environment, tmp_path: Path) -
 
 def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
     checkout, moved = tmp_path / "checkout", tmp_path / "moved"
-    kept = ("sb3_policyflow", "hyperparams", "startup")
-    for name in kept:
+    for name in ("sb3_policyflow", "hyperparams"):
         shutil.copytree(REPOSITORY / name, checkout / name)
-    for name in ("sb3_policyflow_startup.py", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, checkout / name)
     wheel = build("editable", tmp_path, checkout)
     environment = Environment.create(tmp_path / "environment").install(wheel)
@@ -194,5 +192,7 @@ def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
 
 def test_start_file_names_the_same_function() -> None:
     """Python 3.15 and later read it instead of the .pth file."""
-    [line] = (REPOSITORY / "startup/sb3_policyflow.start").read_text().splitlines()
-    assert pkgutil.resolve_name(line) is sb3_policyflow_startup.install
+    folder = Path(sb3_policyflow_startup.__file__).parent
+    [line] = (folder / "sb3_policyflow.start").read_text().splitlines()
+    assert line == f"{sb3_policyflow_startup.__name__.rpartition('.')[2]}:install"
+    assert callable(sb3_policyflow_startup.install)
