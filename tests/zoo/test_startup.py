@@ -6,8 +6,6 @@ from pathlib import Path
 import pytest
 from installation import REPOSITORY, Environment, build
 
-from sb3_policyflow.startup import sb3_policyflow_startup
-
 ALGORITHMS = "import rl_zoo3.utils; print('policyflow' in rl_zoo3.utils.ALGOS)"
 FINDERS = "import sys; print([type(f).__name__ for f in sys.meta_path].count('ZooFinder'))"
 
@@ -192,7 +190,10 @@ def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
 
 def test_start_file_names_the_same_function() -> None:
     """Python 3.15 and later read it instead of the .pth file."""
-    folder = Path(sb3_policyflow_startup.__file__).parent
-    [line] = (folder / "sb3_policyflow.start").read_text().splitlines()
-    assert line == f"{sb3_policyflow_startup.__name__.rpartition('.')[2]}:install"
-    assert callable(sb3_policyflow_startup.install)
+    start, pth = (
+        (REPOSITORY / f"sb3_policyflow/startup/sb3_policyflow.{suffix}").read_text()
+        for suffix in ("start", "pth")
+    )
+    assert start == "sb3_policyflow_startup:install\n"
+    assert "import sb3_policyflow_startup" in pth
+    assert "sb3_policyflow_startup.install()" in pth
