@@ -118,7 +118,7 @@ def test_mujoco(installed: Environment, tmp_path: Path) -> None:
     quick = ["-params", "n_steps:16", "batch_size:64", "n_epochs:1"]
     output = installed.run(*TRAIN, "--algo", "policyflow", *options, *quick, folder=tmp_path)
     assert "========== HalfCheetah-v5 ==========" in output
-    assert "('learning_rate', 8e-05)" in output
+    assert "('desired_kl', 0.01)" in output
     assert "Normalization activated: {'gamma': 0.98}" in output
     assert "Saving to logs/policyflow/HalfCheetah-v5_1" in output
 

@@ -67,6 +67,7 @@ def test_every_entry_runs(
     env_id = "InvertedPendulum-v5" if name == "default" else name
     if name == "default" and importlib.util.find_spec("mujoco") is None:
         pytest.skip("mujoco is not installed")
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log here
     given = yaml.safe_load((hyperparams_folder() / f"{algo}.yml").read_text())[name]
     shorter = {"n_steps": 4, "batch_size": 2 * given.get("n_envs", 1), "n_epochs": 1}
     experiment = manager(
