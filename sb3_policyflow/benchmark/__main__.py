@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("subcommand", choices=SUBCOMMANDS, metavar="SUBCOMMAND")
-    name = parser.parse_args(argv[:1]).subcommand
+    name = parser.parse_args(argv[:1] or ["--help"]).subcommand
     module = importlib.import_module(f"sb3_policyflow.benchmark.{name}")
     try:
         code: int = module.main(argv[1:])
