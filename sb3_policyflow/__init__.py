@@ -1,10 +1,10 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
-import sb3_policyflow_startup
 from sb3_policyflow import envs
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
+from sb3_policyflow.startup import sb3_policyflow_startup
 
 __version__ = "0.1.0"
 

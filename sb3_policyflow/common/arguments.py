@@ -136,6 +136,8 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
 
     def _check_arguments(self) -> None:
         """Refuse what cannot be used, before networks and buffers are made."""
+        space = getattr(self, "observation_space", None)
+        checks.check_environment(type(self).__name__, self.env, space)
         check_flow_spaces(self.action_space, self.use_sde)
         checks.check_policy_class(type(self).__name__, self.policy_class, self.policy_base)
         checks.check_at_least("n_steps", self.n_steps, 1)

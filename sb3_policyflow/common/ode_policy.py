@@ -7,9 +7,10 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
-from sb3_policyflow.flows import SOLVERS, Path, integrate
+from sb3_policyflow.flows import SOLVERS, Path
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.solvers import solver_times
+from sb3_policyflow.fused.sampler import FlowSampler
 
 
 class OdeFlowPolicy(FlowActorCriticPolicy):
@@ -48,6 +49,7 @@ class OdeFlowPolicy(FlowActorCriticPolicy):
         choose("solver", solver, SOLVERS)
         solver_times(solver, n_flow_steps)
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
+        self._flow = FlowSampler(solver, n_flow_steps, flow_path.end_time)
 
     def solver_times(self) -> th.Tensor:
         """The solver's time grid, on the policy's device."""
@@ -61,10 +63,4 @@ class OdeFlowPolicy(FlowActorCriticPolicy):
         :param features: The actor's features, shape (n, features_dim).
         :return: phi, shape (n, action_dim).
         """
-        return integrate(
-            lambda points, time: self.velocity(points, time, features),
-            latents,
-            n_steps=self.n_flow_steps,
-            solver=self.solver,
-            end_time=self.path.end_time,
-        )
+        return self._flow.carry(self.velocity, latents, features)

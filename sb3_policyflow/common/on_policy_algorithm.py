@@ -150,7 +150,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     def _optimise(self, loss: th.Tensor) -> None:
         """Take one step of the optimiser.
 
-        :raises FloatingPointError: If the gradient is not finite; parameters are left alone.
+        :raises FloatingPointError: If loss or gradient are not finite; parameters are left alone.
         """
         self.policy.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -158,8 +158,9 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         max_norm = self.max_grad_norm if clips else float("inf")
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), max_norm)
         if not th.isfinite(norm):
+            what = "gradient" if th.isfinite(loss) else "loss"
             raise FloatingPointError(
-                f"The gradient is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
+                f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
                 "The parameters are those of the last good step and can be saved: lower the "
                 f"learning rate{self.divergence_advice}."
             )

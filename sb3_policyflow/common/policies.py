@@ -17,7 +17,9 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_policyflow.flows import VelocityField
+from sb3_policyflow.fused.fields import FusedVelocityField
+from sb3_policyflow.fused.networks import Perceptron, Reader, Reading
+from sb3_policyflow.fused.perceptron import evaluate_perceptron
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -136,6 +138,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         # Those of a Gaussian actor, as is the optimizer.
         del self.action_net, self.log_std
         self._build_actor()
+        self._critic = Reading(read_critic)
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]  # every torch optimizer takes one
@@ -144,7 +147,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def _build_actor(self) -> None:
         """Build what the actor learns, apart from the features extractor."""
-        self.velocity = VelocityField(
+        self.velocity = FusedVelocityField(
             self.action_dim,
             self.features_dim,
             net_arch=self._layers("pi"),
@@ -167,13 +170,17 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
-        values: th.Tensor = self.value_net(self.mlp_extractor.forward_critic(features))
+        network = self._critic.of(self)
+        values = None if network is None else evaluate_perceptron(network, features)
+        if values is None:
+            values = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
         """Z ~ N(0, I), or 0 for the deterministic action, shape (n, action_dim)."""
         draw = th.zeros if deterministic and not self.random_latents else th.randn
-        return draw(len(features), self.action_dim, device=features.device, dtype=features.dtype)
+        size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
+        return draw(size, device=features.device, dtype=features.dtype)
 
     @abstractmethod
     def sample_actions(
@@ -217,6 +224,18 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )
+
+
+def read_critic(reader: Reader, policy: FlowActorCriticPolicy) -> Perceptron | None:
+    """The critic behind the features, or None if it is not of the kind that kernels know."""
+    reader.children(policy)
+    if type(policy.mlp_extractor) is not MlpExtractor or not reader.is_plain(policy.mlp_extractor):
+        return None
+    reader.children(policy.mlp_extractor)
+    hidden = policy.mlp_extractor.value_net
+    if not reader.is_plain(hidden):
+        return None
+    return reader.perceptron((*reader.children(hidden), policy.value_net))
 
 
 def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:

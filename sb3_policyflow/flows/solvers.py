@@ -31,8 +31,20 @@ class Solver(Protocol):
     def subdivisions(self) -> int:
         """Parts into which the evaluation times divide a step."""
 
-    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
-        """Carry ``points`` from the first to the last of ``times``."""
+    def solve(
+        self,
+        velocity: Velocity,
+        points: th.Tensor,
+        times: th.Tensor,
+        labels: th.Tensor | None = None,
+    ) -> th.Tensor:
+        """Carry ``points`` from the first to the last of ``times``.
+
+        :param velocity: The field ``velocity(points, time)``.
+        :param points: Where the flow starts, shape (..., dim).
+        :param times: The solver's times, shape (n,).
+        :param labels: What the field is given in place of each time, shape (n, ...).
+        """
 
 
 @dataclass(frozen=True)
@@ -57,19 +69,28 @@ class RungeKutta:
         """2 if the velocity is also evaluated in the middle of a step, 1 otherwise."""
         return 2 if 0.5 in self.nodes else 1
 
-    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+    def solve(
+        self,
+        velocity: Velocity,
+        points: th.Tensor,
+        times: th.Tensor,
+        labels: th.Tensor | None = None,
+    ) -> th.Tensor:
         """Carry ``points`` from the first to the last of ``times``, ``subdivisions`` to a step."""
+        labels = times if labels is None else labels
         n_parts = self.subdivisions
         for start in range(0, len(times) - 1, n_parts):
-            points = self._step(velocity, points, times[start : start + n_parts + 1])
+            step = times[start + n_parts] - times[start]
+            points = self._step(velocity, points, step, labels[start : start + n_parts + 1])
         return points
 
-    def _step(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
-        step = times[-1] - times[0]
+    def _step(
+        self, velocity: Velocity, points: th.Tensor, step: th.Tensor, labels: th.Tensor
+    ) -> th.Tensor:
         slopes: list[th.Tensor] = []
         for node, row in zip(self.nodes, self.matrix, strict=True):
-            time = times[round(node * self.subdivisions)]
-            slopes.append(velocity(points + step * _weighted_sum(row, slopes), time))
+            label = labels[round(node * self.subdivisions)]
+            slopes.append(velocity(points + step * _weighted_sum(row, slopes), label))
         return points + step * _weighted_sum(self.weights, slopes)
 
 
@@ -84,11 +105,18 @@ class AdamsBashforth2:
     evaluations: int = 1
     subdivisions: int = 1
 
-    def solve(self, velocity: Velocity, points: th.Tensor, times: th.Tensor) -> th.Tensor:
+    def solve(
+        self,
+        velocity: Velocity,
+        points: th.Tensor,
+        times: th.Tensor,
+        labels: th.Tensor | None = None,
+    ) -> th.Tensor:
         """Carry ``points`` from the first to the last of ``times``."""
+        labels = times if labels is None else labels
         previous: th.Tensor | None = None
-        for time, next_time in pairwise(times):
-            slope = velocity(points, time)
+        for (time, next_time), label in zip(pairwise(times), labels[:-1], strict=True):
+            slope = velocity(points, label)
             change = slope if previous is None else 1.5 * slope - 0.5 * previous
             points = points + (next_time - time) * change
             previous = slope

@@ -99,6 +99,11 @@ class VelocityField(nn.Module):
         self.output = nn.Linear([dim + embedding_dim, *net_arch][-1], dim)
         initialise(self)
 
+    @property
+    def layers(self) -> list[nn.Module]:
+        """What the MLP consists of: linear layers with activations between them."""
+        return [*self.hidden, self.output]
+
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         """Velocity at points, times and features, whose leading shapes broadcast.
 

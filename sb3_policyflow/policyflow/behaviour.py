@@ -1,7 +1,6 @@
 """The policy that made the rollout, kept while the update changes the policy."""
 
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
 from torch.func import functional_call
 
 from sb3_policyflow.common.chunks import in_chunks
@@ -9,25 +8,22 @@ from sb3_policyflow.policyflow.policies import FlowPolicy
 
 
 class Behaviour:
-    """A frozen view of a policy, for the observations of one rollout (paper, v-hat and sigma-hat).
+    """A frozen view of a policy, for one rollout (paper, v-hat and sigma-hat).
 
-    Features of the observations are extracted once for the whole update, because the policy that
-    made the rollout does not change any more. Nothing of it is saved with a model.
+    Nothing of it is saved with a model.
 
-    :param policy: The policy, in evaluation mode and not yet updated.
-    :param observations: The rollout's n observations.
+    :param policy: The policy, not yet updated.
+    :param features: Its actor's features of the rollout's observations, (n, features_dim). One
+        extraction serves the whole update, because the policy of the rollout stays what it was.
     """
 
-    def __init__(self, policy: FlowPolicy, observations: PyTorchObs) -> None:
+    def __init__(self, policy: FlowPolicy, features: th.Tensor) -> None:
         self.log_std = policy.noise_log_std.detach().clone()
         self._field = policy.velocity
         self._parameters = {
             name: tensor.detach().clone() for name, tensor in self._field.state_dict().items()
         }
-        self._features = self._extract(policy, observations)
-
-    def _extract(self, policy: FlowPolicy, observations: PyTorchObs) -> th.Tensor:
-        return in_chunks(policy.actor_features, observations)
+        self._features = features
 
     def velocity(self, points: th.Tensor, times: th.Tensor) -> th.Tensor:
         """The old velocity for the rollout's n samples.

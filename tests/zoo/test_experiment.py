@@ -26,6 +26,7 @@ SIMULATORS = {
     "LunarLanderContinuous-v3": "Box2D",
     "BipedalWalker-v3": "Box2D",
     "PointMaze_Medium_Diverse_GDense-v3": "gymnasium_robotics",
+    "PointMazeMultiGoal-Medium-v0": "gymnasium_robotics",
     **dict.fromkeys(
         [
             "HalfCheetah-v5",

@@ -1,16 +1,21 @@
 """The startup finder, in interpreters of environments that have the package installed."""
 
-import pkgutil
 import shutil
 from pathlib import Path
 
 import pytest
 from installation import REPOSITORY, Environment, build
 
-import sb3_policyflow_startup
+from sb3_policyflow.startup import sb3_policyflow_startup
 
 ALGORITHMS = "import rl_zoo3.utils; print('policyflow' in rl_zoo3.utils.ALGOS)"
 FINDERS = "import sys; print([type(f).__name__ for f in sys.meta_path].count('ZooFinder'))"
+
+
+def packages(environment: Environment) -> list[str]:
+    """The folders of an environment's packages, for an interpreter that does not look for them."""
+    borrowed = (environment.site_packages / "zz_borrowed.pth").read_text()
+    return [str(environment.site_packages), *borrowed.splitlines()]
 
 
 @pytest.mark.parametrize("options", [[], ["-I"], ["-P", "-s", "-E"], ["-O"]])
@@ -36,7 +41,17 @@ def test_the_switch_turns_it_off(installed: Environment, tmp_path: Path) -> None
     assert installed.run("-c", imported, folder=tmp_path, **off) == "0\n"
 
 
-def test_without_site_an_import_of_the_package_registers(
+def test_without_site_the_package_is_imported_first(installed: Environment, tmp_path: Path) -> None:
+    """The documentation's way with ``pip install --target``."""
+    code = (
+        "import sys; sys.path += {path!r}; sys.argv[1:] = ['--help']\n"
+        "import sb3_policyflow; from rl_zoo3.train import train; train()"
+    )
+    output = installed.run("-S", "-c", code.format(path=packages(installed)), folder=tmp_path)
+    assert "policyflow" in output
+
+
+def test_without_site_an_import_of_the_package_catches_up(
     installed: Environment, tmp_path: Path
 ) -> None:
     code = (
@@ -48,9 +63,7 @@ def test_without_site_an_import_of_the_package_registers(
         "assert hasattr(rl_zoo3.exp_manager.ExperimentManager.__init__, '__wrapped__')\n"
         "print('policyflow' in rl_zoo3.utils.ALGOS)"
     )
-    path = installed.run("-c", "import sys; print(sys.path)", folder=tmp_path)
-    found = [entry for entry in eval(path) if entry.endswith("-packages")]
-    output = installed.run("-S", "-c", code.format(path=found), folder=tmp_path)
+    output = installed.run("-S", "-c", code.format(path=packages(installed)), folder=tmp_path)
     assert output.endswith("True\n")
 
 
@@ -97,21 +110,18 @@ def test_rl_zoo3_in_a_zip_file(installed: Environment, tmp_path: Path) -> None:
     assert installed.run("-W", "error", "-c", code, folder=tmp_path).endswith("True\n")
 
 
-@pytest.mark.parametrize("method", ["spawn", "forkserver"])
-def test_worker_processes_know_the_environments(
-    installed: Environment, tmp_path: Path, method: str
-) -> None:
+def test_worker_processes_know_the_environments(installed: Environment, tmp_path: Path) -> None:
     tmp_path.joinpath("script.py").write_text(
-        "import sys, gymnasium\n"
+        "import gymnasium\n"
         "from stable_baselines3.common.vec_env import SubprocVecEnv\n"
         "def make():\n"
         "    import rl_zoo3.utils\n"
         "    return gymnasium.make('MultiGoal-v0')\n"
         "if __name__ == '__main__':\n"
-        "    env = SubprocVecEnv([make], start_method=sys.argv[1])\n"
+        "    env = SubprocVecEnv([make], start_method='spawn')\n"
         "    print(env.reset().shape); env.close()\n"
     )
-    assert installed.run("script.py", method, folder=tmp_path).endswith("(1, 4)\n")
+    assert installed.run("script.py", folder=tmp_path).endswith("(1, 4)\n")
 
 
 def test_a_broken_package_is_said_and_harms_nobody(
@@ -161,10 +171,9 @@ def test_uninstalling_leaves_nothing(environment: Environment, tmp_path: Path) -
 
 def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
     checkout, moved = tmp_path / "checkout", tmp_path / "moved"
-    kept = ("sb3_policyflow", "hyperparams", "startup")
-    for name in kept:
+    for name in ("sb3_policyflow", "hyperparams"):
         shutil.copytree(REPOSITORY / name, checkout / name)
-    for name in ("sb3_policyflow_startup.py", "pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, checkout / name)
     wheel = build("editable", tmp_path, checkout)
     environment = Environment.create(tmp_path / "environment").install(wheel)
@@ -183,5 +192,7 @@ def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
 
 def test_start_file_names_the_same_function() -> None:
     """Python 3.15 and later read it instead of the .pth file."""
-    [line] = (REPOSITORY / "startup/sb3_policyflow.start").read_text().splitlines()
-    assert pkgutil.resolve_name(line) is sb3_policyflow_startup.install
+    folder = Path(sb3_policyflow_startup.__file__).parent
+    [line] = (folder / "sb3_policyflow.start").read_text().splitlines()
+    assert line == f"{sb3_policyflow_startup.__name__.rpartition('.')[2]}:install"
+    assert callable(sb3_policyflow_startup.install)

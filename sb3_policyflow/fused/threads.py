@@ -1,0 +1,44 @@
+"""Rows shared out among threads."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import torch as th
+
+WORTHWHILE = 4_000_000
+"""Multiplications for which it pays to wake another thread."""
+
+
+def n_parts(n_rows: int, work_per_row: int) -> int:
+    """In how many parts to do some work.
+
+    :param n_rows: How many rows there are.
+    :param work_per_row: Multiplications for each.
+    """
+    return max(1, min(th.get_num_threads(), n_rows * work_per_row // WORTHWHILE, n_rows))
+
+
+def in_parts(n_rows: int, parts: int, run: Callable[[int, int, int], None]) -> None:
+    """Call ``run(part, start, stop)`` for parts of the rows, each on a thread of its own.
+
+    :param n_rows: How many rows there are.
+    :param parts: In how many parts.
+    :param run: Works on some of the rows, for the most part without Python's global lock.
+    """
+    bounds = [n_rows * part // parts for part in range(parts + 1)]
+    others = [_pool().submit(run, part, *bounds[part : part + 2]) for part in range(1, parts)]
+    run(0, *bounds[:2])
+    for other in others:
+        other.result()
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="sb3_policyflow")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
