@@ -4,6 +4,8 @@ import argparse
 import importlib
 import sys
 
+from sb3_policyflow.benchmark.results import ResultsError
+
 SUBCOMMANDS = {
     "demo": "train PolicyFlow on MultiGoal and show which goals it reaches",
     "run": "train and evaluate algorithms, environments and seeds",
@@ -24,9 +26,13 @@ def main(argv: list[str]) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("subcommand", choices=SUBCOMMANDS, metavar="SUBCOMMAND")
-    name = parser.parse_args(argv[:1]).subcommand
+    name = parser.parse_args(argv[:1] or ["--help"]).subcommand
     module = importlib.import_module(f"sb3_policyflow.benchmark.{name}")
-    code: int = module.main(argv[1:])
+    try:
+        code: int = module.main(argv[1:])
+    except ResultsError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
     return code
 
 

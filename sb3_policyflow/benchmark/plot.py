@@ -70,7 +70,7 @@ def improvement_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Fig
     axes = figure.subplots()
     for place, (label, interval) in enumerate(reversed(pairs)):
         axes.plot([interval.low, interval.high], [place, place], color=GREY, linewidth=6)
-        axes.plot(interval.estimate, place, "o", color=SERIES_COLOURS[0])
+        axes.plot(interval.estimate, place, "o", color=SERIES_COLOURS[0], clip_on=False)
         axes.text(-0.02, place, label, ha="right", va="center", fontsize=8, color=INK)
     axes.axvline(0.5, color=GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
     axes.set(xlim=(0, 1), ylim=(-0.6, len(pairs) - 0.4), yticks=[])

@@ -14,6 +14,10 @@ from typing import Any
 CURVE_FIELDS = ("timesteps", "mode", "mean_return", "std_return", "mean_length", "n_episodes")
 
 
+class ResultsError(ValueError):
+    """The files are not what a command needs; the message says what to do."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """One training.
@@ -46,14 +50,14 @@ class Cell:
     def is_done(self, folder: Path) -> bool:
         """Whether it has been run.
 
-        :raises ValueError: If it has been, with other settings.
+        :raises ResultsError: If it has been, with other settings.
         """
         path = self.path(folder, ".json")
         if not path.is_file():
             return False
         settings = json.loads(path.read_text(encoding="utf-8"))["cell"]
         if settings != asdict(self):
-            raise ValueError(
+            raise ResultsError(
                 f"{path} was made with other settings, {settings}: choose another --out, or "
                 "delete it."
             )
@@ -94,11 +98,11 @@ class Result:
 def load_results(folder: Path) -> list[Result]:
     """Everything that has been run, in the order of names, environments and seeds.
 
-    :raises ValueError: If there is nothing.
+    :raises ResultsError: If there is nothing.
     """
     results = [_load(path) for path in folder.glob("*/*/seed-*.json")]
     if not results:
-        raise ValueError(f"No results in {folder}: make some with the subcommand run.")
+        raise ResultsError(f"No results in {folder}: make some with the subcommand run.")
     return sorted(results, key=lambda r: (r.cell.name, r.cell.env, r.cell.seed))
 
 

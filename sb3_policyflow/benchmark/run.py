@@ -29,7 +29,7 @@ def run_cells(
     :param n_jobs: Processes at a time.
     :param n_threads: Threads of each.
     :return: The cells that failed.
-    :raises ValueError: If a cell has been run with other settings.
+    :raises ResultsError: If a cell has been run with other settings.
     """
     cells = list(cells)
     missing = [cell for cell in cells if not cell.is_done(folder)]

@@ -15,6 +15,7 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.benchmark import costs
+from sb3_policyflow.benchmark.__main__ import main
 from sb3_policyflow.benchmark.evaluation import evaluate, modes
 from sb3_policyflow.benchmark.results import Cell, Result, load_results
 from sb3_policyflow.benchmark.table import improvement_table, results_table
@@ -70,10 +71,10 @@ def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
     assert len(load_results(folder)) == 3
 
 
-def test_other_settings_are_refused(folder: Path) -> None:
-    outcome = run(folder, "fpo", "--episodes", "3")
-    assert outcome.returncode != 0
-    assert "was made with other settings" in outcome.stderr
+def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--algos", "fpo", "--envs", "Pendulum-v1", "--steps", "11", "--out", str(folder)]
+    assert main(["run", *settings]) == 2
+    assert "was made with other settings" in capsys.readouterr().err
 
 
 def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
@@ -86,25 +87,25 @@ def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
 
 
 def test_table_and_plot(folder: Path, tmp_path: Path) -> None:
-    table = benchmark("table", str(folder))
-    assert table.returncode == 0, table.stderr
-    assert "| Pendulum-v1, 10 steps | fpo | 1 |" in table.stdout
-    assert benchmark("plot", str(folder), "--out", str(tmp_path)).returncode == 0
+    assert main(["table", str(folder), "--out", str(tmp_path / "table.md")]) == 0
+    assert "| Pendulum-v1, 10 steps | fpo | 1 |" in (tmp_path / "table.md").read_text()
+    assert main(["plot", str(folder), "--out", str(tmp_path)]) == 0
     assert (tmp_path / "curves.png").stat().st_size > 10_000
     assert (tmp_path / "improvement.png").stat().st_size > 5_000
 
 
-def test_no_results(tmp_path: Path) -> None:
-    outcome = benchmark("table", str(tmp_path))
-    assert outcome.returncode != 0
-    assert "No results in" in outcome.stderr
+def test_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("No results in")
 
 
-def test_usage() -> None:
-    outcome = benchmark("--help")
-    assert outcome.returncode == 0
-    assert "multigoal" in outcome.stdout
-    assert benchmark("nonsense").returncode == 2
+@pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), (["nonsense"], 2), ([], 0)])
+def test_usage(arguments: list[str], code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_of:
+        main(arguments)
+    assert exit_of.value.code == code
+    written = capsys.readouterr()
+    assert "multigoal" in written.out + written.err
 
 
 def result(name: str, seed: int, value: float) -> Result:
