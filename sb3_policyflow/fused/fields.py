@@ -4,6 +4,7 @@ import math
 from itertools import chain
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from torch.autograd.function import once_differentiable
 
@@ -17,10 +18,10 @@ from sb3_policyflow.fused.networks import (
     Reading,
     in_memory,
 )
-from sb3_policyflow.fused.perceptron import FirstLayer, Pass
+from sb3_policyflow.fused.perceptron import FirstLayer, Gradients, Pass
 
-MANY = 2**20
-"""Work of embedding times for which it pays to look for repetitions among them."""
+FEW = 32
+"""Times among which it does not pay to look for repetitions."""
 
 
 class FieldParts(NamedTuple):
@@ -80,7 +81,7 @@ class FusedVelocityField(VelocityField):
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
-        if parts is None or not in_memory((points, times, features)):
+        if parts is None or times.requires_grad or not in_memory((points, times, features)):
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
@@ -99,7 +100,7 @@ class FusedVelocityField(VelocityField):
         """Times without their repetitions, and for each row of a shape which it has."""
         table = times.reshape(-1)
         index = th.arange(len(table))
-        if len(table) * self.observation_embedding.out_features**2 > MANY:
+        if len(table) > FEW:
             table, index = th.unique(table, return_inverse=True)
         return table, index.view_as(times).expand(leading).reshape(-1)
 
@@ -107,13 +108,10 @@ class FusedVelocityField(VelocityField):
 class _Embedding:
     """What time and observation contribute to a field's first layer, and the way back.
 
-    table = (t_emb(times) + b_o) W_e^T + b,    shifts = features (W_e W_o)^T
-
     :param activation: Activation of the time embedding.
     :param times: shape (n_times,).
     :param features: shape (m, features_dim).
     :param tensors: Those of the field, see :class:`FieldParts`.
-    :param keeps: Whether to keep what the way back needs.
     """
 
     def __init__(
@@ -122,48 +120,58 @@ class _Embedding:
         times: th.Tensor,
         features: th.Tensor,
         tensors: list[th.Tensor],
-        keeps: bool,
     ) -> None:
-        frequencies, *self._time, self._weight, bias, weight, first_bias = tensors[:9]
-        phases = 2 * math.pi * times.unsqueeze(-1) * frequencies
-        self._phases = th.cat([phases.cos(), phases.sin()], dim=-1)
-        self._way = Pass(activation, self._time_layer(), self._time[2:], keeps)
-        dim = weight.shape[1] - len(bias)
-        self.of_points, self._of_embedding = weight[:, :dim], weight[:, dim:]
-        self._embeddings = self._way.outputs.add_(bias)
-        self.table = th.addmm(first_bias, self._embeddings, self._of_embedding.T)
-        self._folded = self._of_embedding @ self._weight
-        self._features = features
-        self.shifts = features @ self._folded.T
-
-    def _time_layer(self) -> FirstLayer:
-        weight, bias = self._time[:2]
-        n_times = len(self._phases)
-        index = th.zeros(n_times, dtype=th.int64)
-        return FirstLayer(
-            self._phases, weight, bias.view(1, -1), index, bias.new_empty(0, len(bias))
+        weight, bias = tensors[7:9]
+        n_times, width, size = len(times), len(bias), len(tensors[6])
+        self._dim = weight.shape[1] - size
+        phases = times.unsqueeze(-1) * (2 * math.pi * tensors[0])
+        phases = th.cat([phases.cos(), phases.sin()], dim=-1)
+        self._inputs = (phases.numpy(), features.numpy())
+        self._kept = features.new_empty(3, n_times, size).numpy()
+        self.table = features.new_empty(n_times, width)
+        self.shifts = features.new_empty(len(features), width)
+        module: Any = kernels()
+        module.embed(
+            *self._inputs,
+            _addresses(tensors),
+            self._dim,
+            getattr(module, activation.name),
+            activation.alpha,
+            *self._kept,
+            self.table.numpy(),
+            self.shifts.numpy(),
         )
 
     def back(
-        self, grad_table: th.Tensor, grad_shifts: th.Tensor, needs_features: bool
-    ) -> tuple[th.Tensor | None, list[th.Tensor], th.Tensor]:
-        """Gradients of features, of all tensors up to the first layer, and of its part W_e."""
-        grad_folded = grad_shifts.T @ self._features
-        grad_embeddings = grad_table @ self._of_embedding
-        time = self._way.back(self._time_layer(), self._time[2:], grad_embeddings)
-        grad_of_embedding = grad_table.T @ self._embeddings
-        grad_of_embedding.addmm_(grad_folded, self._weight.T)
-        return (
-            grad_shifts @ self._folded if needs_features else None,
-            [
-                time.weight.contiguous(),
-                time.table.view(-1),
-                *time.others,
-                self._of_embedding.T @ grad_folded,
-                grad_embeddings.sum(0),
-            ],
-            grad_of_embedding,
+        self, tensors: list[th.Tensor], rows: Gradients, needs_features: bool
+    ) -> tuple[th.Tensor | None, tuple[th.Tensor, ...]]:
+        """Gradients of the features, and of the parameters up to the first layer.
+
+        :param tensors: Those of the field again.
+        :param rows: Gradients of the first layer.
+        :param needs_features: Whether those of the features are wanted.
+        """
+        sizes = [tensor.numel() for tensor in tensors[1:9]]
+        flat = rows.table.new_empty(sum(sizes))
+        features = self._inputs[1]
+        grad_features = flat.new_empty(features.shape if needs_features else (0, 0))
+        module: Any = kernels()
+        module.embed_backward(
+            *self._inputs,
+            _addresses(tensors),
+            self._dim,
+            *self._kept,
+            rows.weight.T.numpy(),
+            rows.table.numpy(),
+            rows.shifts.numpy(),
+            flat.numpy(),
+            grad_features.numpy(),
         )
+        return grad_features if needs_features else None, flat.split(sizes)
+
+
+def _addresses(tensors: list[th.Tensor]) -> Any:
+    return np.array([tensor.data_ptr() for tensor in tensors[1:9]])
 
 
 class _FieldEvaluation(th.autograd.Function):
@@ -180,38 +188,21 @@ class _FieldEvaluation(th.autograd.Function):
         *tensors: th.Tensor,
     ) -> th.Tensor:
         keeps = any(ctx.needs_input_grad)
-        embedding = _Embedding(activations[0], times, features, list(tensors), keeps)
-        first = FirstLayer(points, embedding.of_points, embedding.table, index, embedding.shifts)
+        embedding = _Embedding(activations[0], times, features, list(tensors))
+        weight = tensors[7][:, : points.shape[1]]
+        first = FirstLayer(points, weight, embedding.table, index, embedding.shifts)
         way = Pass(activations[1], first, list(tensors[9:]), keeps)
         if keeps:
-            ctx.embedding, ctx.way, ctx.index = embedding, way, index
-            ctx.save_for_backward(points, *tensors)
+            ctx.embedding, ctx.way, ctx.first = embedding, way, first
+            ctx.save_for_backward(*tensors)
         return way.outputs
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        points, *tensors = ctx.saved_tensors
-        embedding: _Embedding = ctx.embedding
-        first = FirstLayer(
-            points, embedding.of_points, embedding.table, ctx.index, embedding.shifts
-        )
+        tensors = ctx.saved_tensors
         needs_points, needs_features = ctx.needs_input_grad[3:5]
-        grads = ctx.way.back(first, tensors[9:], grad_outputs, needs_points)
-        features, up_to_first, of_embedding = embedding.back(
-            grads.table, grads.shifts, needs_features
-        )
-        weight = th.cat([grads.weight, of_embedding], dim=1)
-        bias = grads.table.sum(0)
-        return (
-            None,
-            None,
-            None,
-            grads.inputs,
-            features,
-            None,
-            *up_to_first,
-            weight,
-            bias,
-            *grads.others,
-        )
+        rows = ctx.way.back(ctx.first, tensors[9:], grad_outputs, needs_points)
+        features, others = ctx.embedding.back(tensors, rows, needs_features)
+        grads = [g.view_as(t) for g, t in zip(others, tensors[1:9], strict=True)]
+        return None, None, None, rows.inputs, features, None, *grads, *rows.others

@@ -618,3 +618,155 @@ def _backward_block(
 def _multiply(values: Floats, factors: Floats) -> None:
     for i in range(values.size):
         values[i] *= factors[i]
+
+
+# What time and observation contribute to the first layer of a velocity field
+#
+# table = (MLP(phases) + b_o) W_e^T + b,    shifts = features (W_e W_o)^T
+
+
+@njit(**SUMS_INNER)
+def _transposed(matrix: Any) -> Floats:
+    """The transposed matrix, laid out row by row."""
+    n_rows, n_columns = matrix.shape
+    copy = np.empty((n_columns, n_rows), F)
+    for i in range(n_columns):
+        for j in range(n_rows):
+            copy[i, j] = matrix[j, i]
+    return copy
+
+
+@njit(**SUMS_INNER)
+def _product(inputs: Any, weights: Floats) -> Floats:
+    product = np.empty((inputs.shape[0], weights.shape[1]), F)
+    _clear(product)
+    accumulate(inputs, weights, product)
+    return product
+
+
+@njit(**SUMS_INNER)
+def _layer(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> None:
+    """Outputs = inputs @ weights + bias."""
+    for row in range(inputs.shape[0]):
+        _copy(bias, outputs[row])
+    accumulate(inputs, weights, outputs)
+
+
+@njit(**SUMS)
+def embed(
+    phases: Floats,
+    features: Floats,
+    addresses: Integers,
+    dim: int,
+    kind: int,
+    alpha: float,
+    hidden: Floats,
+    slopes: Floats,
+    embeddings: Floats,
+    table: Floats,
+    shifts: Floats,
+) -> None:
+    """Evaluate the table of times and the shifts of observations.
+
+    :param phases: Cosines and sines, shape (n_times, n_phases).
+    :param features: shape (m, n_features).
+    :param addresses: Of weight and bias of the time embedding's two layers, of the observation
+        embedding, and of the field's first layer.
+    :param dim: Dimensions of the points, the first columns of the first layer's weight.
+    :param kind: Activation of the time embedding.
+    :param alpha: Its parameter.
+    :param hidden: Filled with the time embedding's hidden layer, shape (n_times, size).
+    :param slopes: Filled with its slopes.
+    :param embeddings: Filled with its outputs plus b_o, shape (n_times, size).
+    :param table: Filled; shape (n_times, width).
+    :param shifts: Filled; shape (m, width).
+    """
+    size, width, n_features = hidden.shape[1], table.shape[1], features.shape[1]
+    n_phases = phases.shape[1]
+    bias = carray(_floats(addresses[1]), (size,))
+    _layer(phases, _transposed(carray(_floats(addresses[0]), (size, n_phases))), bias, hidden)
+    activate_with_slopes(kind, F(alpha), hidden.reshape(-1), slopes.reshape(-1))
+    bias = carray(_floats(addresses[3]), (size,))
+    _layer(hidden, _transposed(carray(_floats(addresses[2]), (size, size))), bias, embeddings)
+    observation_bias = carray(_floats(addresses[5]), (size,))
+    for row in range(embeddings.shape[0]):
+        _add(observation_bias, embeddings[row])
+    first = _transposed(carray(_floats(addresses[6]), (width, dim + size)))[dim:]
+    _layer(embeddings, first, carray(_floats(addresses[7]), (width,)), table)
+    observation = carray(_floats(addresses[4]), (size, n_features))
+    _clear(shifts)
+    accumulate(features, _product(observation.T, first), shifts)
+
+
+@njit(**SUMS)
+def embed_backward(
+    phases: Floats,
+    features: Floats,
+    addresses: Integers,
+    dim: int,
+    hidden: Floats,
+    slopes: Floats,
+    embeddings: Floats,
+    grad_points: Floats,
+    grad_table: Floats,
+    grad_shifts: Floats,
+    grads: Floats,
+    grad_features: Floats,
+) -> None:
+    """Gradients of what :func:`embed` takes.
+
+    :param grad_points: Of the first layer's weights of the points, shape (dim, width).
+    :param grads: Filled in the order of the addresses, flat.
+    :param grad_features: Filled; shape (m, n_features), or empty.
+
+    For the others see :func:`embed`.
+    """
+    size, width, n_features = hidden.shape[1], grad_table.shape[1], features.shape[1]
+    n_phases = phases.shape[1]
+    first = carray(_floats(addresses[6]), (width, dim + size))
+    of_embedding = np.empty((width, size), F)
+    for row in range(width):
+        _copy(first[row, dim:], of_embedding[row])
+    observation = _transposed(carray(_floats(addresses[4]), (size, n_features)))
+    grad_folded = _product(features.T, grad_shifts)
+    grad_of_embedding = _product(grad_table.T, embeddings)
+    accumulate(grad_folded.T, observation, grad_of_embedding)
+    grad_embeddings = _product(grad_table, of_embedding)
+    grad_hidden = _product(grad_embeddings, carray(_floats(addresses[2]), (size, size)))
+    _multiply(grad_hidden.reshape(-1), slopes.reshape(-1))
+    if grad_features.shape[0] > 0:
+        _clear(grad_features)
+        folded = _product(observation, _transposed(of_embedding))
+        accumulate(grad_shifts, _transposed(folded), grad_features)
+
+    end = _put(_product(grad_hidden.T, phases), grads, 0)
+    end = _put_sums(grad_hidden, grads, end)
+    end = _put(_product(grad_embeddings.T, hidden), grads, end)
+    end = _put_sums(grad_embeddings, grads, end)
+    end = _put(_transposed(_product(grad_folded, of_embedding)), grads, end)
+    end = _put_sums(grad_embeddings, grads, end)
+    for row in range(width):
+        for i in range(dim):
+            grads[end + i] = grad_points[i, row]
+        _copy(grad_of_embedding[row], grads[end + dim :])
+        end += dim + size
+    _put_sums(grad_table, grads, end)
+
+
+@njit(**SUMS_INNER)
+def _put(matrix: Floats, target: Floats, start: int) -> int:
+    """Write a matrix; say where it ends."""
+    end = start + matrix.size
+    _copy(matrix.reshape(-1), target[start:end])
+    return end
+
+
+@njit(**SUMS_INNER)
+def _put_sums(matrix: Floats, target: Floats, start: int) -> int:
+    """Write the sums of a matrix's columns; say where they end."""
+    end = start + matrix.shape[1]
+    sums = target[start:end]
+    _copy(matrix[0], sums)
+    for row in range(1, matrix.shape[0]):
+        _add(matrix[row], sums)
+    return end
