@@ -11,7 +11,7 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 from sb3_policyflow.common.arguments import FlowAlgorithmArguments
 from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.metrics import UpdateMetrics
-from sb3_policyflow.common.optimisation import gradient_norm, scale_gradients
+from sb3_policyflow.common.optimisation import clip_gradients
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 
 
@@ -155,19 +155,17 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
 
         :raises FloatingPointError: If the gradient is not finite; parameters are left alone.
         """
-        self.policy.optimizer.zero_grad()
+        for parameter in parameters:
+            parameter.grad = None
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = gradient_norm(parameters).item()
+        clips = self.max_grad_norm is not None and self.max_grad_norm > 0
+        norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
         if not math.isfinite(norm):
             raise FloatingPointError(
                 f"The gradient is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
                 "The parameters are those of the last good step and can be saved: lower the "
                 f"learning rate{self.divergence_advice}."
             )
-        if self.max_grad_norm is not None and self.max_grad_norm > 0:
-            factor = self.max_grad_norm / (norm + 1e-6)
-            if factor < 1:
-                scale_gradients(parameters, factor)
         self.policy.optimizer.step()
 
     # The log

@@ -1,9 +1,14 @@
 """Optimisers and gradients, with little to do between their large operations."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch as th
+
+from sb3_policyflow.fused.compiler import kernels
+from sb3_policyflow.fused.networks import addresses, in_memory
 
 
 def make_optimizer(
@@ -33,15 +38,22 @@ def make_optimizer(
     return optimizer_class(parameters, **arguments)
 
 
-def gradient_norm(parameters: Iterable[th.nn.Parameter]) -> th.Tensor:
-    """Euclidean norm of all gradients together, a tensor without dimensions.
+def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math.inf) -> float:
+    """Scale the gradients to a Euclidean norm of all together, if theirs is greater.
+
+    Gradients that are not finite are left alone.
 
     :param parameters: Parameters, at least one with a gradient.
+    :param max_norm: The norm.
+    :return: The norm that they had.
     """
-    grads = [p.grad.reshape(-1) for p in parameters if p.grad is not None]
-    return th.cat(grads).norm()
-
-
-def scale_gradients(parameters: Iterable[th.nn.Parameter], factor: float) -> None:
-    """Multiply all gradients."""
-    th._foreach_mul_([p.grad for p in parameters if p.grad is not None], factor)
+    grads = [p.grad for p in parameters if p.grad is not None]
+    module = kernels()
+    if module is not None and in_memory(grads):
+        sizes = np.array([grad.numel() for grad in grads])
+        return float(module.clip(addresses(grads), sizes, max_norm))
+    norm = th.cat([grad.reshape(-1) for grad in grads]).norm().item()
+    factor = max_norm / (norm + 1e-6)
+    if factor < 1 and math.isfinite(norm):
+        th._foreach_mul_(grads, factor)
+    return norm

@@ -1,65 +1,62 @@
 """Velocity fields evaluated and differentiated by kernels."""
 
-import math
-from itertools import chain
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch.autograd.function import once_differentiable
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.fused.compiler import kernels, note_fallback
 from sb3_policyflow.fused.networks import (
-    Activation,
     Layer,
     Perceptron,
     Reader,
     Reading,
+    addresses,
     in_memory,
 )
-from sb3_policyflow.fused.perceptron import FirstLayer, Gradients, Pass
+from sb3_policyflow.fused.perceptron import FirstLayer, Pass, split_like
 
-FEW = 32
-"""Times among which it does not pay to look for repetitions."""
+Array = NDArray[Any]
+N_EMBEDDING = 7
+"""Tensors of the embeddings: frequencies, and the parameters of three layers."""
 
 
-class FieldParts(NamedTuple):
+class FieldParts:
     """What a velocity field consists of, and all tensors that it depends on.
 
-    The tensors are the frequencies and the parameters of the time embedding (four), of the
-    observation embedding (two) and of the network.
+    :param frequencies: Those of the time embedding.
+    :param time: The time embedding's two layers.
+    :param observation: The observation embedding.
+    :param network: The rest.
     """
 
-    time: Perceptron
-    observation: Layer
-    network: Perceptron
-    tensors: list[th.Tensor]
+    def __init__(
+        self, frequencies: th.Tensor, time: Perceptron, observation: Layer, network: Perceptron
+    ) -> None:
+        self.time = time
+        self.network = network
+        self.dim = network.n_outputs
+        self.tensors = [frequencies, *time.parameters, *observation, *network.parameters]
 
 
 def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
     """The parts of a field, or None if it is not of the kind that kernels know."""
-    embedding = field.time_embedding
-    containers = (field, field.hidden, embedding, embedding.mlp)
-    reader.children(field)
-    network = reader.perceptron((*reader.children(field.hidden), field.output))
-    observation = reader.layer(field.observation_embedding)
-    reader.children(embedding)
-    time = reader.perceptron(reader.children(embedding.mlp))
-    if (
-        not isinstance(field, VelocityField)
-        or type(embedding) is not FourierTimeEmbedding
-        or not all([reader.is_plain(module) for module in containers])
-        or network is None
-        or observation is None
-        or time is None
-        or len(time.layers) != 2
-    ):
-        note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
-        return None
-    layers = chain(time.layers, (observation,), network.layers)
-    tensors = [embedding.frequencies, *chain.from_iterable(layers)]
-    return FieldParts(time, observation, network, tensors)
+    embedding = reader.child(field, "time_embedding")
+    hidden = reader.child(field, "hidden")
+    if type(embedding) is FourierTimeEmbedding and isinstance(hidden, th.nn.Sequential):
+        mlp = reader.child(embedding, "mlp")
+        time = reader.perceptron(reader.children(mlp))
+        observation = reader.layer(reader.child(field, "observation_embedding"))
+        network = reader.perceptron((*reader.children(hidden), reader.child(field, "output")))
+        are_known = time is not None and observation is not None and network is not None
+        if are_known and reader.are_plain(field, hidden, embedding, mlp):
+            return FieldParts(embedding.frequencies, time, observation, network)
+    note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
+    return None
 
 
 class FusedVelocityField(VelocityField):
@@ -86,92 +83,81 @@ class FusedVelocityField(VelocityField):
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
             features = features.expand(*leading, -1)
-        activations = (parts.time.activation, parts.network.activation)
         velocity: th.Tensor = _FieldEvaluation.apply(
-            activations,
-            *self._tabulate(times, leading),
+            parts,
+            times,
+            leading,
             points.reshape(-1, points.shape[-1]),
             features.reshape(-1, features.shape[-1]),
             *parts.tensors,
         )
         return velocity.view_as(points)
 
-    def _tabulate(self, times: th.Tensor, leading: th.Size) -> tuple[th.Tensor, th.Tensor]:
-        """Times without their repetitions, and for each row of a shape which it has."""
-        table = times.reshape(-1)
-        index = th.arange(len(table))
-        if len(table) > FEW:
-            table, index = th.unique(table, return_inverse=True)
-        return table, index.view_as(times).expand(leading).reshape(-1)
-
 
 class _Embedding:
     """What time and observation contribute to a field's first layer, and the way back.
 
-    :param activation: Activation of the time embedding.
+    :param parts: The field.
     :param times: shape (n_times,).
     :param features: shape (m, features_dim).
-    :param tensors: Those of the field, see :class:`FieldParts`.
     """
 
-    def __init__(
-        self,
-        activation: Activation,
-        times: th.Tensor,
-        features: th.Tensor,
-        tensors: list[th.Tensor],
-    ) -> None:
-        weight, bias = tensors[7:9]
-        n_times, width, size = len(times), len(bias), len(tensors[6])
-        self._dim = weight.shape[1] - size
-        phases = times.unsqueeze(-1) * (2 * math.pi * tensors[0])
-        phases = th.cat([phases.cos(), phases.sin()], dim=-1)
-        self._inputs = (phases.numpy(), features.numpy())
-        self._kept = features.new_empty(3, n_times, size).numpy()
-        self.table = features.new_empty(n_times, width)
-        self.shifts = features.new_empty(len(features), width)
-        module: Any = kernels()
-        module.embed(
-            *self._inputs,
-            _addresses(tensors),
+    def __init__(self, parts: FieldParts, times: Array, features: Array) -> None:
+        self._dim = parts.dim
+        self._times, self._features = times.reshape(-1).copy(), features
+        frequencies, width, size = parts.tensors[0], parts.network.widths[0], parts.time.n_outputs
+        self._n_frequencies = len(frequencies)
+        n_times = self._times.size
+        self._kept = np.empty((3, n_times, size), dtype=np.float32)
+        table = np.empty((n_times, width), dtype=np.float32)
+        self.index = np.empty(n_times, dtype=np.int64)
+        self.shifts = np.empty((len(features), width), dtype=np.float32)
+        n_distinct = kernels().embed(  # type: ignore[union-attr]
+            self._times,
+            self.index,
+            self._n_frequencies,
+            features,
+            addresses(parts.tensors[: N_EMBEDDING + 2]),
             self._dim,
-            getattr(module, activation.name),
-            activation.alpha,
-            *self._kept,
-            self.table.numpy(),
-            self.shifts.numpy(),
+            *parts.time.activation,
+            self._kept,
+            table,
+            self.shifts,
         )
+        self._times, self.table = self._times[:n_distinct], table[:n_distinct]
 
     def back(
-        self, tensors: list[th.Tensor], rows: Gradients, needs_features: bool
-    ) -> tuple[th.Tensor | None, tuple[th.Tensor, ...]]:
-        """Gradients of the features, and of the parameters up to the first layer.
+        self,
+        tensors: Sequence[th.Tensor],
+        grad_points: Array,
+        grad_table: Array,
+        grad_shifts: Array,
+        grad_features: Array,
+    ) -> th.Tensor:
+        """Gradients of the parameters up to the first layer, one behind the other.
 
-        :param tensors: Those of the field again.
-        :param rows: Gradients of the first layer.
-        :param needs_features: Whether those of the features are wanted.
+        :param tensors: Those of the field.
+        :param grad_points: Of W^T, shape (dim, width).
+        :param grad_table: Like the table.
+        :param grad_shifts: Like the shifts.
+        :param grad_features: Filled; shape (m, features_dim), or empty if it is not wanted.
         """
-        sizes = [tensor.numel() for tensor in tensors[1:9]]
-        flat = rows.table.new_empty(sum(sizes))
-        features = self._inputs[1]
-        grad_features = flat.new_empty(features.shape if needs_features else (0, 0))
-        module: Any = kernels()
-        module.embed_backward(
-            *self._inputs,
-            _addresses(tensors),
+        tensors = tensors[: N_EMBEDDING + 2]
+        grads = th.empty(sum(tensor.numel() for tensor in tensors[1:]))
+        kernels().embed_backward(  # type: ignore[union-attr]
+            self._times,
+            self._n_frequencies,
+            self._features,
+            addresses(tensors),
             self._dim,
-            *self._kept,
-            rows.weight.T.numpy(),
-            rows.table.numpy(),
-            rows.shifts.numpy(),
-            flat.numpy(),
-            grad_features.numpy(),
+            self._kept,
+            grad_points,
+            grad_table,
+            grad_shifts,
+            grads.numpy(),
+            grad_features,
         )
-        return grad_features if needs_features else None, flat.split(sizes)
-
-
-def _addresses(tensors: list[th.Tensor]) -> Any:
-    return np.array([tensor.data_ptr() for tensor in tensors[1:9]])
+        return grads
 
 
 class _FieldEvaluation(th.autograd.Function):
@@ -180,29 +166,46 @@ class _FieldEvaluation(th.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        activations: tuple[Activation, Activation],
+        parts: FieldParts,
         times: th.Tensor,
-        index: th.Tensor,
+        leading: th.Size,
         points: th.Tensor,
         features: th.Tensor,
         *tensors: th.Tensor,
     ) -> th.Tensor:
         keeps = any(ctx.needs_input_grad)
-        embedding = _Embedding(activations[0], times, features, list(tensors))
-        weight = tensors[7][:, : points.shape[1]]
-        first = FirstLayer(points, weight, embedding.table, index, embedding.shifts)
-        way = Pass(activations[1], first, list(tensors[9:]), keeps)
+        embedding = _Embedding(parts, times.numpy(), features.numpy())
+        index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
+        stride = tensors[N_EMBEDDING].shape[1]
+        first = FirstLayer(points.numpy(), stride, embedding.table, index, embedding.shifts)
+        way = Pass(parts.network, first, keeps)
         if keeps:
-            ctx.embedding, ctx.way, ctx.first = embedding, way, first
-            ctx.save_for_backward(*tensors)
+            ctx.embedding, ctx.way = embedding, way
+            ctx.save_for_backward(points, features, *tensors)
         return way.outputs
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        tensors = ctx.saved_tensors
+        points, features, *tensors = ctx.saved_tensors
         needs_points, needs_features = ctx.needs_input_grad[3:5]
-        rows = ctx.way.back(ctx.first, tensors[9:], grad_outputs, needs_points)
-        features, others = ctx.embedding.back(tensors, rows, needs_features)
-        grads = [g.view_as(t) for g, t in zip(others, tensors[1:9], strict=True)]
-        return None, None, None, rows.inputs, features, None, *grads, *rows.others
+        grad_points = th.empty_like(points if needs_points else points[:0])
+        grad_features = th.empty_like(features if needs_features else features[:0])
+        embedding = ctx.embedding
+        flat, grad_shifts = ctx.way.back(tensors[N_EMBEDDING:], grad_outputs, grad_points.numpy())
+        dim, (n_times, width) = points.shape[1], embedding.table.shape
+        first = flat[: (dim + n_times) * width].view(-1, width).numpy()
+        up_to_first = embedding.back(
+            tensors, first[:dim], first[dim:], grad_shifts, grad_features.numpy()
+        )
+        others = flat[(dim + n_times) * width :]
+        return (
+            None,
+            None,
+            None,
+            grad_points if needs_points else None,
+            grad_features if needs_features else None,
+            None,
+            *split_like(up_to_first, tensors[1 : N_EMBEDDING + 2]),
+            *split_like(others, tensors[N_EMBEDDING + 2 :]),
+        )
