@@ -7,7 +7,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows
+from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows, size_in_bytes
+
+SHUFFLED_AT_ONCE = 2**26
+"""Bytes of a rollout up to which a shuffled copy of it is made for each epoch."""
 
 
 class RecordBufferMixin(RolloutBuffer):
@@ -98,12 +101,16 @@ class RecordBufferMixin(RolloutBuffer):
         n_samples = self.buffer_size * self.n_envs
         order = np.random.permutation(n_samples)
         # SB3 numbers transitions environment by environment, ``samples`` step by step.
-        indices = th.as_tensor(
+        indices: th.Tensor | None = th.as_tensor(
             order % self.buffer_size * self.n_envs + order // self.buffer_size, device=self.device
         )
         size = batch_size or n_samples
+        if size_in_bytes(samples) <= SHUFFLED_AT_ONCE:
+            # One gather of all rows, of which minibatches are views, is faster than many of few.
+            samples, indices = rows(samples, indices), None
         for start in range(0, n_samples, size):
-            yield rows(samples, indices[start : start + size])
+            chosen = slice(start, start + size)
+            yield rows(samples, chosen if indices is None else indices[chosen])
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """Go through the rollout once in minibatches, in random order."""

@@ -1,5 +1,6 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
+import math
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 from sb3_policyflow.common.arguments import FlowAlgorithmArguments
 from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.metrics import UpdateMetrics
+from sb3_policyflow.common.optimisation import clip_gradients
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 
 
@@ -81,13 +83,14 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     ) -> bool:
         """Go through the rollout once; False if the policy has gone too far from the old one."""
         self.policy.set_training_mode(True)
+        parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.minibatches(rollout, self.batch_size):
             loss, kl, figures = self._loss(batch, behaviour)
             metrics.add(figures)
             divergences.append(kl.detach())
             if self.target_kl is not None and kl.item() > 1.5 * self.target_kl:
                 return False
-            self._optimise(loss)
+            self._optimise(loss, parameters)
             if self.lr_adaptation == "minibatch":
                 self._adapt_learning_rate(divergences[-1:])
         if self.lr_adaptation == "epoch":
@@ -147,17 +150,17 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             "log_ratio_max": log_ratio.abs().max(),
         }
 
-    def _optimise(self, loss: th.Tensor) -> None:
+    def _optimise(self, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:
         """Take one step of the optimiser.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters are left alone.
         """
-        self.policy.optimizer.zero_grad()
+        for parameter in parameters:
+            parameter.grad = None
         loss.backward()  # type: ignore[no-untyped-call]
         clips = self.max_grad_norm is not None and self.max_grad_norm > 0
-        max_norm = self.max_grad_norm if clips else float("inf")
-        norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), max_norm)
-        if not th.isfinite(norm):
+        norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
+        if not math.isfinite(norm):
             what = "gradient" if th.isfinite(loss) else "loss"
             raise FloatingPointError(
                 f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "

@@ -17,6 +17,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_policyflow.common.optimisation import make_optimizer
 from sb3_policyflow.fused.fields import FusedVelocityField
 from sb3_policyflow.fused.networks import Perceptron, Reader, Reading
 from sb3_policyflow.fused.perceptron import evaluate_perceptron
@@ -139,10 +140,8 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         del self.action_net, self.log_std
         self._build_actor()
         self._critic = Reading(read_critic)
-        self.optimizer = self.optimizer_class(
-            self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]  # every torch optimizer takes one
-            **self.optimizer_kwargs,
+        self.optimizer = make_optimizer(
+            self.optimizer_class, self.parameters(), lr_schedule(1), self.optimizer_kwargs
         )
 
     def _build_actor(self) -> None:

@@ -44,6 +44,17 @@ def rows(tree: T, chosen: th.Tensor | slice) -> T:
     return map_tensors(lambda values: values[chosen], tree)
 
 
+def size_in_bytes(tree: Any) -> int:
+    """Size of all tensors in nested dictionaries and tuples.
+
+    >>> size_in_bytes({"a": th.zeros(3), "b": (th.zeros(2, dtype=th.int64),)})
+    28
+    """
+    sizes: list[int] = []
+    map_tensors(lambda values: sizes.append(values.nbytes) or values, tree)  # type: ignore[func-returns-value]
+    return sum(sizes)
+
+
 def map_tensors(function: Callable[[th.Tensor], th.Tensor], tree: T) -> T:
     """Apply a function to every tensor in nested dictionaries and tuples.
 

@@ -2,6 +2,7 @@
 
 import logging
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 
 logger = logging.getLogger(__name__)
@@ -9,11 +10,12 @@ logger = logging.getLogger(__name__)
 
 @cache
 def kernels() -> ModuleType | None:
-    """The module of kernels, or None where numba cannot be imported.
+    """The package of kernels, or None where numba cannot be imported.
 
     Imports numba when it is first called, never with the package.
     """
     try:
+        _forget_outdated()
         from sb3_policyflow.fused import kernels as module
     except ImportError as error:
         note_fallback(f"numba cannot be imported ({error})")
@@ -25,3 +27,15 @@ def kernels() -> ModuleType | None:
 def note_fallback(reason: str) -> None:
     """Tell who debugs, once, why plain torch does the work of a kernel."""
     logger.debug("Plain torch does the work of a fused kernel: %s.", reason)
+
+
+def _forget_outdated() -> None:
+    """Delete what was compiled before a kernel's source was changed.
+
+    Numba looks at one file for each kernel, and kernels consist of parts from several.
+    """
+    folder = Path(__file__).parent / "kernels"
+    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    for compiled in folder.glob("__pycache__/*.nb[ci]"):
+        if compiled.stat().st_mtime < newest:
+            compiled.unlink(missing_ok=True)

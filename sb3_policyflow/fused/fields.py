@@ -1,64 +1,62 @@
 """Velocity fields evaluated and differentiated by kernels."""
 
-import math
-from itertools import chain
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch.autograd.function import once_differentiable
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.fused.compiler import kernels, note_fallback
 from sb3_policyflow.fused.networks import (
-    Activation,
     Layer,
     Perceptron,
     Reader,
     Reading,
+    addresses,
     in_memory,
 )
-from sb3_policyflow.fused.perceptron import FirstLayer, Pass
+from sb3_policyflow.fused.perceptron import FirstLayer, Pass, split_like
 
-MANY = 2**20
-"""Work of embedding times for which it pays to look for repetitions among them."""
+Array = NDArray[Any]
+N_EMBEDDING = 7
+"""Tensors of the embeddings: frequencies, and the parameters of three layers."""
 
 
-class FieldParts(NamedTuple):
+class FieldParts:
     """What a velocity field consists of, and all tensors that it depends on.
 
-    The tensors are the frequencies and the parameters of the time embedding (four), of the
-    observation embedding (two) and of the network.
+    :param frequencies: Those of the time embedding.
+    :param time: The time embedding's two layers.
+    :param observation: The observation embedding.
+    :param network: The rest.
     """
 
-    time: Perceptron
-    observation: Layer
-    network: Perceptron
-    tensors: list[th.Tensor]
+    def __init__(
+        self, frequencies: th.Tensor, time: Perceptron, observation: Layer, network: Perceptron
+    ) -> None:
+        self.time = time
+        self.network = network
+        self.dim = network.n_outputs
+        self.tensors = [frequencies, *time.parameters, *observation, *network.parameters]
 
 
 def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
     """The parts of a field, or None if it is not of the kind that kernels know."""
-    embedding = field.time_embedding
-    containers = (field, field.hidden, embedding, embedding.mlp)
-    reader.children(field)
-    network = reader.perceptron((*reader.children(field.hidden), field.output))
-    observation = reader.layer(field.observation_embedding)
-    reader.children(embedding)
-    time = reader.perceptron(reader.children(embedding.mlp))
-    if (
-        not isinstance(field, VelocityField)
-        or type(embedding) is not FourierTimeEmbedding
-        or not all([reader.is_plain(module) for module in containers])
-        or network is None
-        or observation is None
-        or time is None
-        or len(time.layers) != 2
-    ):
-        note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
-        return None
-    layers = chain(time.layers, (observation,), network.layers)
-    tensors = [embedding.frequencies, *chain.from_iterable(layers)]
-    return FieldParts(time, observation, network, tensors)
+    embedding = reader.child(field, "time_embedding")
+    hidden = reader.child(field, "hidden")
+    if type(embedding) is FourierTimeEmbedding and isinstance(hidden, th.nn.Sequential):
+        mlp = reader.child(embedding, "mlp")
+        time = reader.perceptron(reader.children(mlp))
+        observation = reader.layer(reader.child(field, "observation_embedding"))
+        network = reader.perceptron((*reader.children(hidden), reader.child(field, "output")))
+        are_known = time is not None and observation is not None and network is not None
+        if are_known and reader.are_plain(field, hidden, embedding, mlp):
+            return FieldParts(embedding.frequencies, time, observation, network)
+    note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
+    return None
 
 
 class FusedVelocityField(VelocityField):
@@ -80,90 +78,86 @@ class FusedVelocityField(VelocityField):
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
-        if parts is None or not in_memory((points, times, features)):
+        if parts is None or times.requires_grad or not in_memory((points, times, features)):
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
             features = features.expand(*leading, -1)
-        activations = (parts.time.activation, parts.network.activation)
         velocity: th.Tensor = _FieldEvaluation.apply(
-            activations,
-            *self._tabulate(times, leading),
+            parts,
+            times,
+            leading,
             points.reshape(-1, points.shape[-1]),
             features.reshape(-1, features.shape[-1]),
             *parts.tensors,
         )
         return velocity.view_as(points)
 
-    def _tabulate(self, times: th.Tensor, leading: th.Size) -> tuple[th.Tensor, th.Tensor]:
-        """Times without their repetitions, and for each row of a shape which it has."""
-        table = times.reshape(-1)
-        index = th.arange(len(table))
-        if len(table) * self.observation_embedding.out_features**2 > MANY:
-            table, index = th.unique(table, return_inverse=True)
-        return table, index.view_as(times).expand(leading).reshape(-1)
-
 
 class _Embedding:
     """What time and observation contribute to a field's first layer, and the way back.
 
-    table = (t_emb(times) + b_o) W_e^T + b,    shifts = features (W_e W_o)^T
-
-    :param activation: Activation of the time embedding.
+    :param parts: The field.
     :param times: shape (n_times,).
     :param features: shape (m, features_dim).
-    :param tensors: Those of the field, see :class:`FieldParts`.
-    :param keeps: Whether to keep what the way back needs.
     """
 
-    def __init__(
-        self,
-        activation: Activation,
-        times: th.Tensor,
-        features: th.Tensor,
-        tensors: list[th.Tensor],
-        keeps: bool,
-    ) -> None:
-        frequencies, *self._time, self._weight, bias, weight, first_bias = tensors[:9]
-        phases = 2 * math.pi * times.unsqueeze(-1) * frequencies
-        self._phases = th.cat([phases.cos(), phases.sin()], dim=-1)
-        self._way = Pass(activation, self._time_layer(), self._time[2:], keeps)
-        dim = weight.shape[1] - len(bias)
-        self.of_points, self._of_embedding = weight[:, :dim], weight[:, dim:]
-        self._embeddings = self._way.outputs.add_(bias)
-        self.table = th.addmm(first_bias, self._embeddings, self._of_embedding.T)
-        self._folded = self._of_embedding @ self._weight
-        self._features = features
-        self.shifts = features @ self._folded.T
-
-    def _time_layer(self) -> FirstLayer:
-        weight, bias = self._time[:2]
-        n_times = len(self._phases)
-        index = th.zeros(n_times, dtype=th.int64)
-        return FirstLayer(
-            self._phases, weight, bias.view(1, -1), index, bias.new_empty(0, len(bias))
+    def __init__(self, parts: FieldParts, times: Array, features: Array) -> None:
+        self._dim = parts.dim
+        self._times, self._features = times.reshape(-1).copy(), features
+        frequencies, width, size = parts.tensors[0], parts.network.widths[0], parts.time.n_outputs
+        self._n_frequencies = len(frequencies)
+        n_times = self._times.size
+        self._kept = np.empty((3, n_times, size), dtype=np.float32)
+        table = np.empty((n_times, width), dtype=np.float32)
+        self.index = np.empty(n_times, dtype=np.int64)
+        self.shifts = np.empty((len(features), width), dtype=np.float32)
+        n_distinct = kernels().embed(  # type: ignore[union-attr]
+            self._times,
+            self.index,
+            self._n_frequencies,
+            features,
+            addresses(parts.tensors[: N_EMBEDDING + 2]),
+            self._dim,
+            *parts.time.activation,
+            self._kept,
+            table,
+            self.shifts,
         )
+        self._times, self.table = self._times[:n_distinct], table[:n_distinct]
 
     def back(
-        self, grad_table: th.Tensor, grad_shifts: th.Tensor, needs_features: bool
-    ) -> tuple[th.Tensor | None, list[th.Tensor], th.Tensor]:
-        """Gradients of features, of all tensors up to the first layer, and of its part W_e."""
-        grad_folded = grad_shifts.T @ self._features
-        grad_embeddings = grad_table @ self._of_embedding
-        time = self._way.back(self._time_layer(), self._time[2:], grad_embeddings)
-        grad_of_embedding = grad_table.T @ self._embeddings
-        grad_of_embedding.addmm_(grad_folded, self._weight.T)
-        return (
-            grad_shifts @ self._folded if needs_features else None,
-            [
-                time.weight.contiguous(),
-                time.table.view(-1),
-                *time.others,
-                self._of_embedding.T @ grad_folded,
-                grad_embeddings.sum(0),
-            ],
-            grad_of_embedding,
+        self,
+        tensors: Sequence[th.Tensor],
+        grad_points: Array,
+        grad_table: Array,
+        grad_shifts: Array,
+        grad_features: Array,
+    ) -> th.Tensor:
+        """Gradients of the parameters up to the first layer, one behind the other.
+
+        :param tensors: Those of the field.
+        :param grad_points: Of W^T, shape (dim, width).
+        :param grad_table: Like the table.
+        :param grad_shifts: Like the shifts.
+        :param grad_features: Filled; shape (m, features_dim), or empty if it is not wanted.
+        """
+        tensors = tensors[: N_EMBEDDING + 2]
+        grads = th.empty(sum(tensor.numel() for tensor in tensors[1:]))
+        kernels().embed_backward(  # type: ignore[union-attr]
+            self._times,
+            self._n_frequencies,
+            self._features,
+            addresses(tensors),
+            self._dim,
+            self._kept,
+            grad_points,
+            grad_table,
+            grad_shifts,
+            grads.numpy(),
+            grad_features,
         )
+        return grads
 
 
 class _FieldEvaluation(th.autograd.Function):
@@ -172,46 +166,46 @@ class _FieldEvaluation(th.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        activations: tuple[Activation, Activation],
+        parts: FieldParts,
         times: th.Tensor,
-        index: th.Tensor,
+        leading: th.Size,
         points: th.Tensor,
         features: th.Tensor,
         *tensors: th.Tensor,
     ) -> th.Tensor:
         keeps = any(ctx.needs_input_grad)
-        embedding = _Embedding(activations[0], times, features, list(tensors), keeps)
-        first = FirstLayer(points, embedding.of_points, embedding.table, index, embedding.shifts)
-        way = Pass(activations[1], first, list(tensors[9:]), keeps)
+        embedding = _Embedding(parts, times.numpy(), features.numpy())
+        index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
+        stride = tensors[N_EMBEDDING].shape[1]
+        first = FirstLayer(points.numpy(), stride, embedding.table, index, embedding.shifts)
+        way = Pass(parts.network, first, keeps)
         if keeps:
-            ctx.embedding, ctx.way, ctx.index = embedding, way, index
-            ctx.save_for_backward(points, *tensors)
+            ctx.embedding, ctx.way = embedding, way
+            ctx.save_for_backward(points, features, *tensors)
         return way.outputs
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        points, *tensors = ctx.saved_tensors
-        embedding: _Embedding = ctx.embedding
-        first = FirstLayer(
-            points, embedding.of_points, embedding.table, ctx.index, embedding.shifts
-        )
+        points, features, *tensors = ctx.saved_tensors
         needs_points, needs_features = ctx.needs_input_grad[3:5]
-        grads = ctx.way.back(first, tensors[9:], grad_outputs, needs_points)
-        features, up_to_first, of_embedding = embedding.back(
-            grads.table, grads.shifts, needs_features
+        grad_points = th.empty_like(points if needs_points else points[:0])
+        grad_features = th.empty_like(features if needs_features else features[:0])
+        embedding = ctx.embedding
+        flat, grad_shifts = ctx.way.back(tensors[N_EMBEDDING:], grad_outputs, grad_points.numpy())
+        dim, (n_times, width) = points.shape[1], embedding.table.shape
+        first = flat[: (dim + n_times) * width].view(-1, width).numpy()
+        up_to_first = embedding.back(
+            tensors, first[:dim], first[dim:], grad_shifts, grad_features.numpy()
         )
-        weight = th.cat([grads.weight, of_embedding], dim=1)
-        bias = grads.table.sum(0)
+        others = flat[(dim + n_times) * width :]
         return (
             None,
             None,
             None,
-            grads.inputs,
-            features,
+            grad_points if needs_points else None,
+            grad_features if needs_features else None,
             None,
-            *up_to_first,
-            weight,
-            bias,
-            *grads.others,
+            *split_like(up_to_first, tensors[1 : N_EMBEDDING + 2]),
+            *split_like(others, tensors[N_EMBEDDING + 2 :]),
         )

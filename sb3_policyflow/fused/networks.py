@@ -3,17 +3,14 @@
 from collections.abc import Callable, Iterable
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
 
+from sb3_policyflow.fused.activations import PLAIN, WITH_ALPHA, Activation
+
 T = TypeVar("T")
-
-
-class Activation(NamedTuple):
-    """An activation by its name among the kernels, and its parameter."""
-
-    name: str
-    alpha: float = 0.0
 
 
 class Layer(NamedTuple):
@@ -23,20 +20,22 @@ class Layer(NamedTuple):
     bias: th.Tensor
 
 
-class Perceptron(NamedTuple):
-    """Linear layers, at least two, with one activation between them."""
+class Perceptron:
+    """Linear layers, at least two, with one activation between them.
 
-    layers: list[Layer]
-    activation: Activation
+    :param layers: Their parameters.
+    :param activation: The activation.
+    """
 
-
-_SIMPLE: dict[type[nn.Module], Activation] = {
-    nn.ReLU: Activation("RELU"),
-    nn.Tanh: Activation("TANH"),
-    nn.Sigmoid: Activation("SIGMOID"),
-    nn.SiLU: Activation("SILU"),
-    nn.Mish: Activation("MISH"),
-}
+    def __init__(self, layers: list[Layer], activation: Activation) -> None:
+        self.layers = layers
+        self.activation = activation
+        self.parameters = [tensor for layer in layers for tensor in layer]
+        widths = [len(layer.bias) for layer in layers]
+        self.n_outputs = widths.pop()
+        self.n_hidden = sum(widths)
+        self.widths: NDArray[np.int64] = np.array(widths)
+        self.work = sum(layer.weight.numel() for layer in layers)
 
 
 class Reader:
@@ -57,7 +56,7 @@ class Reader:
         """
         if any(self._hooks):
             return False
-        for place, name, thing in self._places:
+        for place, name, thing in self._places:  # noqa: SIM110  # all() takes twice as long
             if place.get(name) is not thing:
                 return False
         return True
@@ -73,10 +72,19 @@ class Reader:
         self._hooks += hooks
         return not any(hooks)
 
-    def children(self, module: nn.Module) -> list[nn.Module]:
-        """The modules within a module."""
-        self._places += [(module._modules, name, child) for name, child in module._modules.items()]
-        return [child for child in module._modules.values() if child is not None]
+    def are_plain(self, *modules: nn.Module) -> bool:
+        """Whether :meth:`is_plain` holds for all of them."""
+        return all(list(map(self.is_plain, modules)))
+
+    def child(self, module: nn.Module, name: str) -> Any:
+        """A module within a module."""
+        child = module._modules[name]
+        self._places.append((module._modules, name, child))
+        return child
+
+    def children(self, module: nn.Module) -> list[Any]:
+        """All modules within a module."""
+        return [self.child(module, name) for name in module._modules]
 
     def layer(self, module: nn.Module) -> Layer | None:
         """The parameters of a module that is nothing but linear, or None."""
@@ -93,31 +101,30 @@ class Reader:
         """An activation as the kernels know it, or None.
 
         >>> Reader().activation(nn.ELU(0.5)), Reader().activation(nn.GELU())
-        (Activation(name='ELU', alpha=0.5), None)
+        (Activation(kind=2, alpha=0.5), None)
         """
         if not self.is_plain(module):
             return None
-        if type(module) is nn.ELU:
-            self._places.append((module.__dict__, "alpha", module.alpha))
-            return Activation("ELU", module.alpha)
-        if type(module) is nn.LeakyReLU:
-            self._places.append((module.__dict__, "negative_slope", module.negative_slope))
-            return Activation("LEAKY_RELU", module.negative_slope)
-        return _SIMPLE.get(type(module))
+        if type(module) not in WITH_ALPHA:
+            return PLAIN.get(type(module))
+        kind, name = WITH_ALPHA[type(module)]
+        alpha = module.__dict__[name]
+        self._places.append((module.__dict__, name, alpha))
+        return Activation(kind, float(alpha))
 
     def perceptron(self, modules: Iterable[nn.Module]) -> Perceptron | None:
         """The network that the modules make up, or None if it is of another kind.
 
         >>> modules = [nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1)]
-        >>> Reader().perceptron(modules).activation
-        Activation(name='TANH', alpha=0.0)
+        >>> Reader().perceptron(modules).widths
+        array([3])
         >>> Reader().perceptron([*modules, nn.Tanh()]) is None
         True
         """
         modules = list(modules)
         layers = [self.layer(module) for module in modules[::2]]
-        activations = {self.activation(module) for module in modules[1::2]}
         known = [layer for layer in layers if layer is not None]
+        activations = {self.activation(module) for module in modules[1::2]}
         if len(activations) != 1 or len(modules) % 2 == 0 or len(known) < len(layers):
             return None
         activation = activations.pop()
@@ -151,9 +158,14 @@ class Reading(Generic[T]):
 
 
 def in_memory(tensors: Iterable[th.Tensor]) -> bool:
-    """Whether kernels can read these tensors: contiguous float32 on the CPU."""
+    """Whether kernels can work on these tensors: contiguous float32 on the CPU."""
     for tensor in tensors:
         if tensor.dtype is not th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
             return False
     # Within torch.func's transformations, tensors stand for others.
     return th._C._functorch.peek_interpreter_stack() is None
+
+
+def addresses(tensors: Iterable[th.Tensor]) -> NDArray[np.int64]:
+    """Where tensors start in memory."""
+    return np.array([tensor.data_ptr() for tensor in tensors])

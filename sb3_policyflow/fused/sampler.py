@@ -91,11 +91,9 @@ class FlowSampler:
         module: Any = kernels()
         if self._snapshot.renew(parts.tensors):
             self._network, self._method = self._derive(field, parts)
-            self._work = self._stages.size * sum(
-                t.numel() for layer in parts.network.layers for t in layer
-            )
+            self._work = self._stages.size * parts.network.work
         endpoints = th.empty_like(latents)
-        arrays = (features.detach().numpy(), latents.detach().numpy(), endpoints.numpy())
+        arrays = (features.numpy(), latents.numpy(), endpoints.numpy())
         in_parts(
             len(latents),
             n_parts(len(latents), self._work),
@@ -115,10 +113,10 @@ class FlowSampler:
             points=first.points.T.contiguous().numpy(),
             features=first.features.T.contiguous().numpy(),
             hidden=(th.cat(hidden) if hidden else th.zeros(0)).numpy(),
-            widths=np.array([len(layer.bias) for layer in parts.network.layers[:-1]]),
+            widths=parts.network.widths,
             output=output.weight.numpy().copy(),
             bias=output.bias.numpy().copy(),
-            kind=getattr(module, activation.name),
+            kind=activation.kind,
             alpha=np.float32(activation.alpha),
         )
         return network, module.Method(first.table.numpy(), self._stages, self._tableau)

@@ -245,7 +245,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
             log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
         return PolicyTerms(
             log_ratio=log_ratio,
-            kl=gaussian_kl(shift, log_std, old_log_std).mean(),
+            kl=gaussian_kl(shift.detach(), log_std.detach(), old_log_std).mean(),
             regulariser=regulariser,
             metrics={**figures, "velocity_change": change.detach().norm(dim=-1).mean()},
         )
@@ -254,12 +254,13 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         self, probes: Probes, velocity: th.Tensor, features: th.Tensor
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """What keeps the policy from becoming narrow, and its parts to log."""
-        brownian_loss = self._brownian_loss(probes, velocity)
-        entropy = gaussian_entropy(self.policy.noise_log_std)
-        brownian_coef, ent_coef = (
-            self._now(self._brownian_schedule),
-            self._now(self._entropy_schedule),
+        brownian_coef = self._now(self._brownian_schedule)
+        ent_coef = self._now(self._entropy_schedule)
+        # What has no weight is looked at, but needs no gradient.
+        brownian_loss = self._brownian_loss(
+            probes, velocity if brownian_coef != 0 else velocity.detach()
         )
+        entropy = gaussian_entropy(self.policy.noise_log_std)
         regulariser = brownian_coef * brownian_loss - ent_coef * entropy
         figures = {"brownian_loss": brownian_loss, "entropy_loss": -entropy}
         if self._uniform is not None:
