@@ -1,5 +1,6 @@
 """What happens between the environment and SB3's ``collect_rollouts``."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -67,8 +68,11 @@ class RolloutVecEnv(VecEnvWrapper):
             infos[index] = {**infos[index], "TimeLimit.truncated": False}
 
     def _check_finite(self, name: str, values: np.ndarray) -> None:
-        if not np.isfinite(values).all():
+        # The sum is finite unless a number is not, or, which is looked into, it overflows.
+        if values.dtype.kind == "f" and not math.isfinite(values.sum()):
             finite = np.isfinite(values).reshape(self.num_envs, -1).all(axis=1)
+            if finite.all():
+                return
             raise FloatingPointError(
                 f"The environment returned a {name} that is not finite at timestep "
                 f"{self._timestep}, in environment {np.flatnonzero(~finite)[0]}. Training has "

@@ -14,9 +14,7 @@ TRAIN = ["-m", "rl_zoo3.train"]
 
 
 @pytest.fixture(scope="module")
-def trained(
-    installed: Environment, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, str]:
+def trained(installed: Environment, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder that two short runs on MultiGoal left, and the output of the second.
 
     The second may open 256 files, far fewer than it has environments.
@@ -74,9 +72,7 @@ def test_enjoy(
     assert "Success rate" in output
 
 
-def test_training_continues_from_a_model(
-    installed: Environment, trained: tuple[Path, str]
-) -> None:
+def test_training_continues_from_a_model(installed: Environment, trained: tuple[Path, str]) -> None:
     agent = ["-i", "logs/policyflow/MultiGoal-v0_1/MultiGoal-v0.zip", "-f", "continued"]
     options = [*MULTIGOAL, "-n", "4096", *agent, "--eval-freq", "-1", *QUICK]
     output = installed.run(*TRAIN, *options, folder=trained[0])
@@ -98,9 +94,7 @@ def test_record_video_in_colours_of_the_environment(
     assert np.abs(frames[-1].astype(float) - frames[0]).max() > 50  # something moves
 
 
-def test_console_script_trains_and_plots(
-    installed: Environment, trained: tuple[Path, str]
-) -> None:
+def test_console_script_trains_and_plots(installed: Environment, trained: tuple[Path, str]) -> None:
     folder, script = trained[0], console_script()
     options = ["-n", "256", "--eval-freq", "-1", "-params", "n_steps:16", "batch_size:64"]
     train = ["train", "--algo", "policyflow", "--env", "Pendulum-v1", "-f", "script", *options]
@@ -122,9 +116,7 @@ def test_mujoco(installed: Environment, tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed")
     options = ["--env", "HalfCheetah-v5", "-n", "128", "--eval-freq", "-1"]
     quick = ["-params", "n_steps:16", "batch_size:64", "n_epochs:1"]
-    output = installed.run(
-        *TRAIN, "--algo", "policyflow", *options, *quick, folder=tmp_path
-    )
+    output = installed.run(*TRAIN, "--algo", "policyflow", *options, *quick, folder=tmp_path)
     assert "========== HalfCheetah-v5 ==========" in output
     assert "('learning_rate', 8e-05)" in output
     assert "Normalizing input and reward" in output
