@@ -28,7 +28,7 @@ docs: $(VENV)/docs-installed
 clean:
 	rm -rf $(VENV) docs/_build build dist
 
-$(VENV)/demo-installed: EXTRAS := plots
+$(VENV)/demo-installed: EXTRAS := plots,zoo
 $(VENV)/tests-installed: EXTRAS := tests
 $(VENV)/docs-installed: EXTRAS := docs
 

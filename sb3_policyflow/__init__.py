@@ -1,7 +1,6 @@
 """PolicyFlow for Stable-Baselines3: on-policy reinforcement learning with flow policies."""
 
-import sb3_policyflow_startup
-from sb3_policyflow import envs
+from sb3_policyflow import envs, startup
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
@@ -12,4 +11,4 @@ __all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]
 
 envs.register()
 # For interpreters that read no .pth files; others have done it at startup.
-sb3_policyflow_startup.install()
+startup.install()

@@ -119,7 +119,7 @@ def sample_trajectories(
         )[0]
         return actions
 
-    with _seeded(seed):
+    with seeded(seed):
         return _run_episodes(env, act)
 
 
@@ -153,7 +153,11 @@ def _normaliser(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArr
 
 
 @contextmanager
-def _seeded(seed: int | None) -> Iterator[None]:
+def seeded(seed: int | None) -> Iterator[None]:
+    """Draw repeatably within the block, and go on behind it as if nothing had been drawn.
+
+    :param seed: ``None`` to draw from the caller's generators as they are
+    """
     if seed is None:
         yield
         return

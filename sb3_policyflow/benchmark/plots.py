@@ -121,7 +121,7 @@ def learning_curve_figure(
         paths = [files] if isinstance(files, str | Path) else files
         curves = [read_learning_curve(path) for path in paths]
         _draw_curves(axes, name, curves, SERIES_COLOURS[i % len(SERIES_COLOURS)])
-    _style_curves(axes, title, n_lines=len(runs))
+    style_curves(axes, title, n_lines=len(runs))
     return figure
 
 
@@ -138,7 +138,7 @@ def _draw_curves(
         axes.fill_between(grid, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
-def _style_curves(axes: Axes, title: str, n_lines: int) -> None:
+def style_curves(axes: Axes, title: str, n_lines: int) -> None:
     axes.set_title(title, fontsize=10, color=INK, loc="left")
     axes.set_xlabel("environment steps", fontsize=9, color=INK)
     axes.set_ylabel("mean episode return", fontsize=9, color=INK)

@@ -12,10 +12,11 @@ from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuff
 from sb3_policyflow.common.collection import CollectionMixin
 from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
 from sb3_policyflow.common.policies import FlowActorCriticPolicy, check_flow_spaces
+from sb3_policyflow.common.saving import SavingMixin
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 
 
-class FlowAlgorithmArguments(CollectionMixin):
+class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
     """An on-policy algorithm for flow policies, up to its update.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
@@ -135,6 +136,8 @@ class FlowAlgorithmArguments(CollectionMixin):
 
     def _check_arguments(self) -> None:
         """Refuse what cannot be used, before networks and buffers are made."""
+        space = getattr(self, "observation_space", None)
+        checks.check_environment(type(self).__name__, self.env, space)
         check_flow_spaces(self.action_space, self.use_sde)
         checks.check_policy_class(type(self).__name__, self.policy_class, self.policy_base)
         checks.check_at_least("n_steps", self.n_steps, 1)

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
@@ -54,6 +55,22 @@ def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any])
             "'CnnFlowPolicy' or 'MultiInputFlowPolicy', or derive your own from "
             f"{base.__module__}.{base.__name__}."
         )
+
+
+def check_environment(algorithm: str, env: object, observation_space: object) -> None:
+    """Refuse an environment that is missing, or observations that SB3 cannot encode.
+
+    :raises ValueError: If there are no spaces, or a discrete observation does not count from 0.
+    """
+    if observation_space is None:
+        raise ValueError(f"{algorithm} needs an environment to know its spaces: got env={env!r}.")
+    parts = observation_space.values() if isinstance(observation_space, spaces.Dict) else []
+    for space in (observation_space, *parts):
+        if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(space.start):
+            raise ValueError(
+                f"Discrete observations must count from 0, as SB3 encodes them, but the space is "
+                f"{space}: subtract its start in a gymnasium.wrappers.TransformObservation."
+            )
 
 
 def choose_buffer_class(

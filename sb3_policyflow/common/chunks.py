@@ -1,7 +1,7 @@
 """Evaluating whole rollouts without holding all intermediate results at once."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch as th
 
@@ -12,17 +12,23 @@ CHUNK = 8192
 """Rows evaluated at a time: large enough to be fast, small enough for images."""
 
 
-def in_chunks(function: Callable[[T], th.Tensor], tree: T, n_rows: int) -> th.Tensor:
+def in_chunks(function: Callable[[T], th.Tensor], tree: T) -> th.Tensor:
     """Apply a function to the rows of nested tensors, some at a time, without gradients.
 
-    >>> in_chunks(lambda pair: pair[0] + pair[1], (th.ones(3), th.arange(3)), n_rows=3)
+    >>> in_chunks(lambda pair: pair[0] + pair[1], (th.ones(3), th.arange(3)))
     tensor([1., 2., 3.])
 
     :param function: Maps k rows of ``tree`` to a tensor (k, ...).
-    :param tree: Tensors (n_rows, ...) in dictionaries and tuples.
-    :param n_rows: How many rows there are.
-    :return: The results in order, shape (n_rows, ...).
+    :param tree: Tensors (n, ...) in dictionaries and tuples.
+    :return: The results in order, shape (n, ...).
     """
     with th.no_grad():
-        starts = range(0, n_rows, CHUNK)
+        starts = range(0, _n_rows(tree), CHUNK)
         return th.cat([function(rows(tree, slice(start, start + CHUNK))) for start in starts])
+
+
+def _n_rows(tree: Any) -> int:
+    """Length of the first tensor."""
+    while not isinstance(tree, th.Tensor):
+        tree = next(iter(tree.values() if isinstance(tree, dict) else tree))
+    return len(tree)

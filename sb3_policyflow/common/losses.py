@@ -84,7 +84,7 @@ def clipped_surrogate(
 def penalised_surrogate(
     log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
 ) -> th.Tensor:
-    """SPO's objective for each sample, to be maximised (Xie et al., 2024, arXiv 2401.16025).
+    """SPO's objective for each sample, to be maximised (Xie et al., 2025).
 
     rho A - |A| / (2 epsilon) (rho - 1)^2,    greatest at rho = 1 + epsilon sign(A)
 

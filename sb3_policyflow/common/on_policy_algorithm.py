@@ -153,7 +153,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     def _optimise(self, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:
         """Take one step of the optimiser.
 
-        :raises FloatingPointError: If the gradient is not finite; parameters are left alone.
+        :raises FloatingPointError: If loss or gradient are not finite; parameters are left alone.
         """
         for parameter in parameters:
             parameter.grad = None
@@ -161,12 +161,16 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         clips = self.max_grad_norm is not None and self.max_grad_norm > 0
         norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
         if not math.isfinite(norm):
+            what = "gradient" if th.isfinite(loss) else "loss"
             raise FloatingPointError(
-                f"The gradient is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
+                f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
                 "The parameters are those of the last good step and can be saved: lower the "
                 f"learning rate{self.divergence_advice}."
             )
         self.policy.optimizer.step()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_loss"]
 
     # The log
 

@@ -81,12 +81,12 @@ class DPPOPolicy(FlowActorCriticPolicy):
         self.noise_clip = noise_clip
         self.denoised_clip = denoised_clip
         self.identity_skip = identity_skip
-        self._check_options(action_space)
+        self._check_options()
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         # SB3 then scales the actions from [-1, 1] to their space.
         self._squash_output = process == "ddpm"
 
-    def _check_options(self, action_space: spaces.Space[Any]) -> None:
+    def _check_options(self) -> None:
         check_choice("process", self.process_name, ("ddpm", "flow"))
         check_at_least("n_denoising_steps", self.n_denoising_steps, 1)
         if self.n_finetuned_steps is not None:
@@ -94,12 +94,6 @@ class DPPOPolicy(FlowActorCriticPolicy):
             check_at_least("n_denoising_steps", self.n_denoising_steps, self.n_finetuned_steps)
         for name in ("min_sampling_std", "min_log_prob_std", "noise_clip", "denoised_clip"):
             check_positive_or_none(name, getattr(self, name))
-        bounded = isinstance(action_space, spaces.Box) and action_space.is_bounded()
-        if self.process_name == "ddpm" and not bounded:
-            raise ValueError(
-                f"process='ddpm' needs an action space with finite bounds, got {action_space}: "
-                "bound the actions, or use process='flow'."
-            )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "process": self.process_name}

@@ -67,6 +67,7 @@ class GymVectorVecEnv(VecEnv):
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         _require_same_step(env)
         self.env = env
+        self.spec = env.spec  # VecMonitor names the environment in its file
         self._actions: NDArray[Any] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 

@@ -210,7 +210,7 @@ class FPO(SampledEntropyMixin):
         noises = th.randn(*times.shape, action_dim, device=times.device)
         unknown = times.new_empty(times.shape)
         drawn = rollout._replace(probes=Probes(times, noises, unknown))
-        return Probes(times, noises, in_chunks(self._old_losses, drawn, n_samples))
+        return Probes(times, noises, in_chunks(self._old_losses, drawn))
 
     def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Probes) -> Probes:  # noqa: ARG002
         """The same probes in every epoch."""

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.aliases import flow_policy_aliases
+from sb3_policyflow.common.chunks import in_chunks
 from sb3_policyflow.common.losses import (
     gaussian_entropy,
     gaussian_kl,
@@ -72,6 +73,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         ``solver="euler"``, ``n_flow_steps=1`` and ``time_sampler="starts"`` it is PPO's, exactly.
     :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
         regulariser (Ding et al., 2024). Takes the forms of ``brownian_coef``.
+    :param log_ratio_clamp: Greatest absolute log ratio that learns; beyond it there is no gradient
+        and no overflow. None for none. ``train/log_ratio_max`` tells what it was before.
     :raises ValueError: If an argument cannot be used.
     """
 
@@ -122,6 +125,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         brownian_reduction: str = "sum",
         gaussian: bool = False,
         uniform_noise_coef: Coefficient = 0.0,
+        log_ratio_clamp: float | None = None,
         desired_kl: float | None = None,
         lr_adaptation: str = "epoch",
         lr_factor: float = 1.5,
@@ -177,6 +181,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         self.brownian_reduction = brownian_reduction
         self.gaussian = gaussian
         self.uniform_noise_coef = uniform_noise_coef
+        self.log_ratio_clamp = log_ratio_clamp
         if _init_setup_model:
             self._setup_model()
 
@@ -186,6 +191,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         checks.check_at_least("n_times", self.n_times, 1)
         checks.check_choice("time_average", self.time_average, ("objective", "shift"))
         checks.check_choice("brownian_reduction", self.brownian_reduction, ("sum", "mean"))
+        checks.check_positive_or_none("log_ratio_clamp", self.log_ratio_clamp)
         if self.gaussian and (self.brownian_coef, self.uniform_noise_coef) != (0.0, 0.0):
             raise ValueError(
                 "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
@@ -208,7 +214,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
 
     def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Behaviour:
         """The policy before the update, theta-hat and sigma-hat."""
-        return Behaviour(self.policy, rollout.observations)
+        features = in_chunks(self.policy.actor_features, rollout.observations)
+        return Behaviour(self.policy, features)
 
     def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Behaviour) -> Probes:
         """Draw t for each sample and look up the old velocity at x_t."""
@@ -231,9 +238,13 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
             shift = shift.mean(dim=1, keepdim=True)
         noise = (batch.actions - batch.record.endpoints).unsqueeze(1)
         log_std, old_log_std = self.policy.noise_log_std, behaviour.log_std
+        log_ratio = shifted_gaussian_log_ratio(noise, shift, log_std, old_log_std)
         regulariser, figures = self._regulariser(probes, velocity, features)
+        if self.log_ratio_clamp is not None:
+            figures["log_ratio_max"] = log_ratio.detach().abs().max()
+            log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
         return PolicyTerms(
-            log_ratio=shifted_gaussian_log_ratio(noise, shift, log_std, old_log_std),
+            log_ratio=log_ratio,
             kl=gaussian_kl(shift.detach(), log_std.detach(), old_log_std).mean(),
             regulariser=regulariser,
             metrics={**figures, "velocity_change": change.detach().norm(dim=-1).mean()},

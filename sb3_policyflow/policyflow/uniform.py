@@ -15,17 +15,12 @@ class UniformTargets:
     Learning via Q-weighted Variational Policy Optimization", https://arxiv.org/abs/2405.16173,
     with flow matching in place of its noise prediction; summed over action dimensions.
 
-    :param action_space: The actions.
+    :param action_space: The actions; SB3 takes bounded ones only.
     :param path: The interpolation path.
-    :raises ValueError: If there is no uniform distribution, or the path draws noise of its own.
+    :raises ValueError: If the path draws noise of its own.
     """
 
     def __init__(self, action_space: spaces.Box, path: Path) -> None:
-        if not action_space.is_bounded():
-            raise ValueError(
-                f"uniform_noise_coef needs an action space with finite bounds, got {action_space}: "
-                "set it to 0, or bound the actions."
-            )
         if path.stochastic:
             raise ValueError(
                 "uniform_noise_coef needs a path without noise of its own: use path='rectified' "

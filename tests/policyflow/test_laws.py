@@ -53,10 +53,7 @@ def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor
         returns=th.randn(N_SAMPLES, dtype=th.float64),
         record=record,
     )
-    behaviour = Behaviour.__new__(Behaviour)
-    # SB3 casts observations to float32; features are what the policy's float64 part begins with.
-    behaviour._extract = lambda policy, observations: observations  # type: ignore[method-assign]
-    behaviour.__init__(model.policy, features)  # type: ignore[misc]
+    behaviour = Behaviour(model.policy, features)
     return batch._replace(probes=model._draw_probes(batch, behaviour)), features, behaviour
 
 
@@ -101,9 +98,7 @@ def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
     with th.no_grad():
         model.policy.velocity.output.weight.zero_()
         before = model.policy.carry(batch.record.latents, features)
-        behaviour = Behaviour.__new__(Behaviour)
-        behaviour._extract = lambda policy, observations: observations  # type: ignore[method-assign]
-        behaviour.__init__(model.policy, features)  # type: ignore[misc]
+        behaviour = Behaviour(model.policy, features)
         probes = model._draw_probes(batch, behaviour)
         model.policy.velocity.output.bias += change
         true_shift = model.policy.carry(batch.record.latents, features) - before

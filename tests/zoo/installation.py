@@ -12,12 +12,12 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).parents[2]
 
 
-def build(target: str, folder: Path) -> Path:
+def build(target: str, folder: Path, source: Path = REPOSITORY) -> Path:
     """Build the package as a "wheel" or "editable" and return the file."""
     hook = "build_wheel" if target == "wheel" else "build_editable"
     script = f"import hatchling.build as b; print(b.{hook}({str(folder)!r}))"
     output = subprocess.run(
-        [sys.executable, "-c", script], cwd=REPOSITORY, check=True, capture_output=True, text=True
+        [sys.executable, "-c", script], cwd=source, check=True, capture_output=True, text=True
     )
     return folder / output.stdout.split()[-1]
 

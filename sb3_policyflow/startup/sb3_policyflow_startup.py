@@ -50,15 +50,13 @@ class ZooFinder:
         return None
 
 
-FINDER = ZooFinder()
-
-
 def install() -> None:
     """Put the finder in place, once, and register with what is loaded of rl_zoo3 already."""
     if os.environ.get("SB3_POLICYFLOW_ZOO") == "0":
         return
-    if FINDER not in sys.meta_path:
-        sys.meta_path.insert(0, FINDER)
+    # There are two copies of this module, in the package and beside it, but one finder is enough.
+    if not any(type(finder).__name__ == ZooFinder.__name__ for finder in sys.meta_path):
+        sys.meta_path.insert(0, ZooFinder())
     for name in WATCHED:
         if name in sys.modules and not _is_running(sys.modules[name]):
             _register(name)

@@ -1,0 +1,66 @@
+"""Train PolicyFlow on MultiGoal and show which goals it reaches.
+
+Writes ``trajectories.png``, ``learning_curve.png``, ``progress.csv`` and ``model.zip``.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_policyflow.benchmark.experiment import make_experiment
+from sb3_policyflow.benchmark.goals import goal_report, sample_trajectories
+from sb3_policyflow.benchmark.plots import goals_figure, learning_curve_figure
+
+ENV = "MultiGoal-v0"
+N_TRAJECTORIES = 1000
+
+
+def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
+    """Train with the hyperparameters of ``policyflow.yml`` and SB3's progress bar.
+
+    :param seed: Seed of the training.
+    :param steps: Environment steps; those of the YAML file if not given.
+    :param folder: Where the log and the model go.
+    """
+    experiment = make_experiment("policyflow", ENV, steps, seed, str(folder))
+    setup = experiment.setup_experiment()
+    assert setup is not None
+    model = setup[0]
+    assert isinstance(model, OnPolicyAlgorithm)
+    model.set_logger(configure(str(folder), ["csv"]))
+    model.learn(experiment.n_timesteps, progress_bar=True)
+    model.save(folder / "model")
+    return model
+
+
+def main(argv: list[str]) -> int:
+    """Train, sample, draw and report."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_policyflow.benchmark demo", description=__doc__
+    )
+    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument("--steps", type=float, help="environment steps; default: the YAML file's")
+    parser.add_argument("--out", type=Path, default=Path("demo"), help="default: demo")
+    arguments = parser.parse_args(argv)
+    folder: Path = arguments.out
+    folder.mkdir(parents=True, exist_ok=True)
+    steps = None if arguments.steps is None else int(arguments.steps)
+
+    model = train(arguments.seed, steps, folder)
+    trajectories = sample_trajectories(model, N_TRAJECTORIES)
+    goals_figure({"PolicyFlow": trajectories}).savefig(folder / "trajectories.png")
+    learning_curve_figure({"PolicyFlow": folder / "progress.csv"}).savefig(
+        folder / "learning_curve.png"
+    )
+    assert model.ep_info_buffer is not None
+    training_return = np.mean([episode["r"] for episode in model.ep_info_buffer])
+    sys.stdout.write(
+        f"After {model.num_timesteps:,} steps the training return is {training_return:.2f}.\n"
+        f"{N_TRAJECTORIES} stochastic trajectories from the centre: {goal_report(trajectories)}.\n"
+        f"Pictures: {folder / 'trajectories.png'} and {folder / 'learning_curve.png'}.\n"
+    )
+    return 0

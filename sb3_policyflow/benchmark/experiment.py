@@ -1,0 +1,38 @@
+"""rl_zoo3's experiment, so that benchmarks train as ``python -m rl_zoo3.train`` does."""
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from rl_zoo3.exp_manager import ExperimentManager
+
+
+def make_experiment(
+    algo: str,
+    env: str,
+    steps: int | None,
+    seed: int,
+    logs: str,
+    hyperparams: Mapping[str, Any] | None = None,
+) -> ExperimentManager:
+    """An experiment with the hyperparameters of the YAML files.
+
+    :param algo: rl_zoo3's name of the algorithm.
+    :param env: Id of the environment.
+    :param steps: Environment steps; those of the YAML file if not given.
+    :param seed: Seed of the training.
+    :param logs: Folder in which rl_zoo3 keeps its files.
+    :param hyperparams: What differs from the YAML file.
+    """
+    return ExperimentManager(
+        argparse.Namespace(),
+        algo,
+        env,
+        logs,
+        n_timesteps=0 if steps is None else steps,
+        eval_freq=-1,
+        hyperparams=dict(hyperparams or {}),
+        seed=seed,
+        verbose=0,
+        device="cpu",
+    )

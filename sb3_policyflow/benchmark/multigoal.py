@@ -1,0 +1,144 @@
+"""The paper's MultiGoal figure: six policies, 1000 trajectories each from the same point.
+
+Trains what is missing, with every seed; draws the first seed's trajectories to ``multigoal.png``
+and writes the table of all seeds to ``multigoal.md``.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_policyflow.benchmark.goals import Trajectories
+from sb3_policyflow.benchmark.plots import goals_figure
+from sb3_policyflow.benchmark.results import Cell, Result, distinct, load_results
+from sb3_policyflow.benchmark.run import add_running_arguments, report_failures, run_cells
+from sb3_policyflow.benchmark.table import markdown_table
+
+ENV = "MultiGoal-v0"
+HEADER = (
+    "panel",
+    "seeds",
+    "return from the centre",
+    "evaluation return",
+    "goals of 6",
+    "entropy",
+    "no goal",
+    "gradient steps",
+    "minutes",
+)
+
+
+class Panel(NamedTuple):
+    """One panel: its title, rl_zoo3's name of the algorithm, and what differs from its YAML."""
+
+    title: str
+    algo: str
+    hyperparams: dict[str, Any]
+
+
+PANELS = {
+    "a-ppo": Panel("(a) PPO, Gaussian entropy", "ppo", {"ent_coef": 0.001}),
+    "b-dppo": Panel("(b) DPPO", "dppo", {}),
+    "c-fpo": Panel("(c) FPO", "fpo", {}),
+    "d-uniform": Panel(
+        "(d) PolicyFlow, uniform noise",
+        "policyflow",
+        {"brownian_coef": 0.0, "ent_coef": 0.0, "uniform_noise_coef": 0.05},
+    ),
+    "e-gaussian": Panel(
+        "(e) PolicyFlow, Gaussian entropy",
+        "policyflow",
+        {"brownian_coef": 0.0, "ent_coef": 0.001},
+    ),
+    "f-brownian": Panel("(f) PolicyFlow, Brownian regulariser", "policyflow", {}),
+}
+"""The paper's panels (a) to (f)."""
+
+
+def panel_cells(
+    seeds: Sequence[int], steps: int, n_evaluations: int, n_episodes: int
+) -> list[Cell]:
+    """The trainings that the figure needs."""
+    return [
+        Cell(
+            name,
+            panel.algo,
+            ENV,
+            seed,
+            steps,
+            panel.hyperparams,
+            n_evaluations=n_evaluations,
+            n_episodes=n_episodes,
+            n_trajectories=1000,
+        )
+        for seed in seeds
+        for name, panel in PANELS.items()
+    ]
+
+
+def load_trajectories(cell: Cell, folder: Path) -> Trajectories:
+    """The episodes from the centre that a cell kept."""
+    with np.load(cell.path(folder, ".npz")) as kept:
+        positions = kept["positions"].astype(np.float64)
+        return Trajectories(positions, kept["lengths"].astype(int), kept["returns"])
+
+
+def goals_table(results: Sequence[Result]) -> str:
+    """A row for each panel: means over seeds, and the range where there are several."""
+    rows = [
+        _row(name, [result for result in results if result.cell.name == name])
+        for name in distinct(results, "name")
+    ]
+    return markdown_table(HEADER, rows)
+
+
+def _row(name: str, runs: Sequence[Result]) -> list[str]:
+    def over_seeds(values: Sequence[float], digits: int = 2) -> str:
+        mean = f"{np.mean(values):.{digits}f}"
+        return mean if len(values) == 1 else f"{mean} ({min(values):.3g} to {max(values):.3g})"
+
+    goals = [run.summary["goals"] for run in runs]
+    missed = [g["n_missed"] / (g["n_missed"] + sum(g["counts"])) for g in goals]
+    return [
+        PANELS[name].title if name in PANELS else name,
+        str(len(runs)),
+        over_seeds([g["mean_return"] for g in goals]),
+        over_seeds([run.summary["final"]["stochastic"]["mean_return"] for run in runs]),
+        over_seeds([g["n_goals"] for g in goals], digits=1),
+        over_seeds([g["entropy"] for g in goals]),
+        f"{np.mean(missed):.1%}",
+        f"{np.mean([run.summary['gradient_steps'] for run in runs]):,.0f}",
+        f"{np.mean([run.summary['seconds']['training'] for run in runs]) / 60:.1f}",
+    ]
+
+
+def draw(folder: Path, results: Sequence[Result]) -> None:
+    """Write the figure of each panel's first seed, and the table of all."""
+    first = {result.cell.name: result.cell for result in reversed(results)}
+    runs = {
+        PANELS[name].title: load_trajectories(first[name], folder)
+        for name in PANELS
+        if name in first
+    }
+    goals_figure(runs).savefig(folder / "multigoal.png")
+    (folder / "multigoal.md").write_text(goals_table(results) + "\n", encoding="utf-8")
+
+
+def main(argv: list[str]) -> int:
+    """Train what is missing and make the figure."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_policyflow.benchmark multigoal", description=__doc__
+    )
+    parser.add_argument("--steps", type=float, default=7.4e6, help="environment steps of each")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/multigoal"))
+    add_running_arguments(parser)
+    arguments = parser.parse_args(argv)
+    cells = panel_cells(
+        arguments.seeds, int(arguments.steps), arguments.evaluations, arguments.episodes
+    )
+    failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
+    draw(arguments.out, load_results(arguments.out))
+    return report_failures(failed)

@@ -1,0 +1,99 @@
+"""Learning curves and probabilities of improvement of what was run.
+
+A curve is the interquartile mean over seeds, its band the 95 % bootstrap interval.
+"""
+
+import argparse
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sb3_policyflow.benchmark.evaluation import DETERMINISTIC, LATENT_ONLY, STOCHASTIC
+from sb3_policyflow.benchmark.plots import DPI, GREY, SERIES_COLOURS, style_curves
+from sb3_policyflow.benchmark.results import Result, distinct, load_results, select
+from sb3_policyflow.benchmark.run import DEFAULT_FOLDER
+from sb3_policyflow.benchmark.statistics import bootstrap_interval, interquartile_mean, score_matrix
+from sb3_policyflow.benchmark.table import improvement
+from sb3_policyflow.envs.drawing import INK
+
+N_COLUMNS = 3
+
+
+def curves_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Figure:
+    """A panel for each environment, a line for each name."""
+    envs, names = distinct(results, "env"), distinct(results, "name")
+    n_columns = min(N_COLUMNS, len(envs))
+    n_rows = -(-len(envs) // n_columns)
+    figure = Figure(figsize=(4.2 * n_columns, 3.2 * n_rows), dpi=DPI, layout="constrained")
+    panels = np.ravel(figure.subplots(n_rows, n_columns, squeeze=False))
+    for axes, env in zip(panels, envs, strict=False):
+        for name, colour in zip(names, _colours(len(names)), strict=True):
+            _draw_curve(axes, select(results, name, env), mode, colour)
+        style_curves(axes, env, len(names))
+    for axes in panels[len(envs) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _colours(n_names: int) -> list[str]:
+    return [SERIES_COLOURS[i % len(SERIES_COLOURS)] for i in range(n_names)]
+
+
+def _draw_curve(axes: Axes, runs: Sequence[Result], mode: str, colour: str) -> None:
+    curves = [run.returns(mode) for run in runs]
+    curves = [curve for curve in curves if curve[0]]
+    if not curves:
+        return
+    # Runs of one name are evaluated at the same timesteps.
+    timesteps = curves[0][0]
+    points = [score_matrix([list(scores)]) for scores in zip(*(c[1] for c in curves), strict=True)]
+    intervals = np.array([bootstrap_interval(interquartile_mean, scores) for scores in points])
+    axes.plot(timesteps, intervals[:, 0], color=colour, linewidth=1.8, label=runs[0].cell.name)
+    if len(curves) > 1:
+        axes.fill_between(
+            timesteps, intervals[:, 1], intervals[:, 2], color=colour, alpha=0.18, linewidth=0
+        )
+
+
+def improvement_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Figure:
+    """A bar for each pair of names: how likely the first does better, over all environments."""
+    pairs = []
+    for name, other in combinations(distinct(results, "name"), 2):
+        interval = improvement(results, name, other, mode)
+        if interval is not None:
+            pairs.append((f"{name} > {other}", interval))
+    figure = Figure(figsize=(5.6, 0.7 + 0.4 * len(pairs)), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    for place, (label, interval) in enumerate(reversed(pairs)):
+        axes.plot([interval.low, interval.high], [place, place], color=GREY, linewidth=6)
+        axes.plot(interval.estimate, place, "o", color=SERIES_COLOURS[0], clip_on=False)
+        axes.text(-0.02, place, label, ha="right", va="center", fontsize=8, color=INK)
+    axes.axvline(0.5, color=GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+    axes.set(xlim=(0, 1), ylim=(-0.6, len(pairs) - 0.4), yticks=[])
+    axes.set_xlabel("probability of improvement", fontsize=9, color=INK)
+    axes.spines[["left", "top", "right"]].set_visible(False)
+    return figure
+
+
+def main(argv: list[str]) -> int:
+    """Write ``curves.png`` and, for more than one name, ``improvement.png``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_policyflow.benchmark plot", description=__doc__
+    )
+    parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT_FOLDER)
+    parser.add_argument("--out", type=Path, help="a folder; that of the results if not given")
+    parser.add_argument(
+        "--mode", choices=(STOCHASTIC, LATENT_ONLY, DETERMINISTIC), default=STOCHASTIC
+    )
+    arguments = parser.parse_args(argv)
+    results = load_results(arguments.folder)
+    out = arguments.out or arguments.folder
+    out.mkdir(parents=True, exist_ok=True)
+    curves_figure(results, arguments.mode).savefig(out / "curves.png")
+    if len(distinct(results, "name")) > 1:
+        improvement_figure(results, arguments.mode).savefig(out / "improvement.png")
+    return 0

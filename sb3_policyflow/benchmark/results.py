@@ -1,0 +1,126 @@
+"""The files of a benchmark: what a cell of it is, and what came of it.
+
+A folder holds ``NAME/ENV/seed-N.json`` (settings, final evaluations, costs, versions) and
+``seed-N.csv`` (evaluations over time) for each cell: one algorithm, environment and seed.
+"""
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+CURVE_FIELDS = ("timesteps", "mode", "mean_return", "std_return", "mean_length", "n_episodes")
+
+
+class ResultsError(ValueError):
+    """The files are not what a command needs; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training.
+
+    :param name: What the tables call it: the algorithm's name, or that of a variant.
+    :param algo: rl_zoo3's name of the algorithm.
+    :param env: Id of the environment.
+    :param seed: Seed of the training.
+    :param steps: Environment steps.
+    :param hyperparams: What differs from the YAML file.
+    :param n_evaluations: Evaluations, evenly over the training, the last one at its end.
+    :param n_episodes: Episodes of an evaluation, in each mode.
+    :param n_trajectories: MultiGoal episodes from the centre to keep; 0 for none.
+    """
+
+    name: str
+    algo: str
+    env: str
+    seed: int
+    steps: int
+    hyperparams: dict[str, Any] = field(default_factory=dict)
+    n_evaluations: int = 10
+    n_episodes: int = 20
+    n_trajectories: int = 0
+
+    def path(self, folder: Path, suffix: str) -> Path:
+        """Where a file of it is, for instance with the suffix ".json"."""
+        return folder / self.name / self.env.replace("/", "-") / f"seed-{self.seed}{suffix}"
+
+    def is_done(self, folder: Path) -> bool:
+        """Whether it has been run.
+
+        :raises ResultsError: If it has been, with other settings.
+        """
+        path = self.path(folder, ".json")
+        if not path.is_file():
+            return False
+        settings = json.loads(path.read_text(encoding="utf-8"))["cell"]
+        if settings != asdict(self):
+            raise ResultsError(
+                f"{path} was made with other settings, {settings}: choose another --out, or "
+                "delete it."
+            )
+        return True
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of a cell: ``summary`` as in its JSON file, ``curve`` the rows of its CSV file."""
+
+    cell: Cell
+    summary: dict[str, Any]
+    curve: list[dict[str, Any]]
+
+    def save(self, folder: Path) -> None:
+        """Write both files; the cell counts as done once the JSON file is there."""
+        self.cell.path(folder, ".json").parent.mkdir(parents=True, exist_ok=True)
+        with open(self.cell.path(folder, ".csv"), "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, CURVE_FIELDS)
+            writer.writeheader()
+            writer.writerows(self.curve)
+        text = json.dumps({"cell": asdict(self.cell), **self.summary}, indent=1)
+        partial = self.cell.path(folder, ".json.partial")
+        partial.write_text(text + "\n", encoding="utf-8")
+        partial.replace(self.cell.path(folder, ".json"))
+
+    def final_return(self, mode: str) -> float | None:
+        """Mean return at the end of the training; None if there is no such mode."""
+        evaluation = self.summary["final"].get(mode)
+        return None if evaluation is None else float(evaluation["mean_return"])
+
+    def returns(self, mode: str) -> tuple[list[float], list[float]]:
+        """Timesteps and mean returns over the training."""
+        rows = [row for row in self.curve if row["mode"] == mode]
+        return [row["timesteps"] for row in rows], [row["mean_return"] for row in rows]
+
+
+def load_results(folder: Path) -> list[Result]:
+    """Everything that has been run, in the order of names, environments and seeds.
+
+    :raises ResultsError: If there is nothing.
+    """
+    results = [_load(path) for path in folder.glob("*/*/seed-*.json")]
+    if not results:
+        raise ResultsError(f"No results in {folder}: make some with the subcommand run.")
+    return sorted(results, key=lambda r: (r.cell.name, r.cell.env, r.cell.seed))
+
+
+def _load(path: Path) -> Result:
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    with open(path.with_suffix(".csv"), newline="", encoding="utf-8") as file:
+        curve: list[dict[str, Any]] = [
+            {key: value if key == "mode" else float(value) for key, value in row.items()}
+            for row in csv.DictReader(file)
+        ]
+    return Result(Cell(**summary.pop("cell")), summary, curve)
+
+
+def distinct(results: Sequence[Result], what: str) -> list[str]:
+    """The names ("name") or environments ("env") in some results, in their order."""
+    return list(dict.fromkeys(getattr(result.cell, what) for result in results))
+
+
+def select(results: Sequence[Result], name: str, env: str) -> list[Result]:
+    """The seeds of one name in one environment."""
+    return [r for r in results if (r.cell.name, r.cell.env) == (name, env)]

@@ -1,0 +1,135 @@
+"""A Markdown table of what was run: interquartile means over seeds with 95 % intervals, and costs.
+
+Intervals are from the percentile bootstrap over seeds; of one seed there is none.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+
+from sb3_policyflow.benchmark.evaluation import DETERMINISTIC, LATENT_ONLY, STOCHASTIC
+from sb3_policyflow.benchmark.results import Result, distinct, load_results, select
+from sb3_policyflow.benchmark.run import DEFAULT_FOLDER
+from sb3_policyflow.benchmark.statistics import (
+    Interval,
+    bootstrap_interval,
+    interquartile_mean,
+    probability_of_improvement,
+    score_matrix,
+)
+
+MODES = (STOCHASTIC, LATENT_ONLY, DETERMINISTIC)
+HEADER = (
+    "environment",
+    "algorithm",
+    "seeds",
+    *MODES,
+    "gradient steps",
+    "evaluations acting / updating",
+    "minutes",
+)
+
+
+def results_table(results: Sequence[Result]) -> str:
+    """A row for each environment and name."""
+    rows = [
+        _row(select(results, name, env), name, env)
+        for env in distinct(results, "env")
+        for name in distinct(results, "name")
+        if select(results, name, env)
+    ]
+    return markdown_table(HEADER, rows)
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in GitHub's Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _row(runs: Sequence[Result], name: str, env: str) -> list[str]:
+    steps = {run.cell.steps for run in runs}
+    evaluations = [run.summary["network_evaluations"] for run in runs]
+    acting, updating = (np.mean([e[key] for e in evaluations]) for key in ("acting", "updating"))
+    minutes = np.mean([run.summary["seconds"]["training"] for run in runs]) / 60
+    return [
+        f"{env}, {' / '.join(f'{step:.2g}' for step in sorted(steps))} steps",
+        name,
+        str(len(runs)),
+        *(_returns([run.final_return(mode) for run in runs]) for mode in MODES),
+        f"{np.mean([run.summary['gradient_steps'] for run in runs]):,.0f}",
+        f"{acting / 1e6:,.1f} M / {updating / 1e6:,.1f} M",
+        f"{minutes:.1f}",
+    ]
+
+
+def _returns(returns: Sequence[float | None]) -> str:
+    """The interquartile mean with its interval."""
+    scores = [value for value in returns if value is not None]
+    if not scores:
+        return "-"
+    matrix = score_matrix([scores])
+    if len(scores) == 1:
+        return f"{interquartile_mean(matrix):.4g}"
+    return format_interval(bootstrap_interval(interquartile_mean, matrix))
+
+
+def format_interval(interval: Interval) -> str:
+    """Estimate and interval with three digits or more.
+
+    >>> format_interval(Interval(-151.23, -180.0, -140.4))
+    '-151.2 [-180, -140.4]'
+    """
+    return f"{interval.estimate:.4g} [{interval.low:.4g}, {interval.high:.4g}]"
+
+
+def improvement_table(results: Sequence[Result], mode: str = STOCHASTIC) -> str:
+    """Probabilities that one name does better than another, over all environments of both."""
+    rows = []
+    for name, other in permutations(distinct(results, "name"), 2):
+        interval = improvement(results, name, other, mode)
+        if interval is not None:
+            rows.append([name, other, format_interval(interval)])
+    return markdown_table(["", "better than", "probability"], rows)
+
+
+def improvement(results: Sequence[Result], name: str, other: str, mode: str) -> Interval | None:
+    """Probability that one name does better than another; None if they share no environment."""
+    scores: tuple[list[list[float]], list[list[float]]] = ([], [])
+    for env in distinct(results, "env"):
+        pair = [_scores(select(results, who, env), mode) for who in (name, other)]
+        if all(pair):
+            for where, found in zip(scores, pair, strict=True):
+                where.append(found)
+    if not scores[0]:
+        return None
+    return bootstrap_interval(probability_of_improvement, *map(score_matrix, scores))
+
+
+def _scores(runs: Sequence[Result], mode: str) -> list[float]:
+    returns = [run.final_return(mode) for run in runs]
+    return [value for value in returns if value is not None]
+
+
+def main(argv: list[str]) -> int:
+    """Write the tables to the terminal or to a file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_policyflow.benchmark table", description=__doc__
+    )
+    parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT_FOLDER)
+    parser.add_argument("--out", type=Path, help="a file; the terminal if not given")
+    arguments = parser.parse_args(argv)
+    results = load_results(arguments.folder)
+    parts = [results_table(results)]
+    if len(distinct(results, "name")) > 1:
+        parts.append(improvement_table(results))
+    text = "\n\n".join(parts) + "\n"
+    if arguments.out is None:
+        sys.stdout.write(text)
+    else:
+        arguments.out.write_text(text, encoding="utf-8")
+    return 0

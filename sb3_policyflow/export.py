@@ -1,0 +1,247 @@
+"""Policies as files that run without this package: ONNX, or torch alone.
+
+.. code-block:: bash
+
+    python -m sb3_policyflow.export model.zip policy.onnx --vecnormalize vecnormalize.pkl
+"""
+
+import argparse
+import pickle
+import sys
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from sb3_policyflow.common.ode_policy import OdeFlowPolicy
+from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.flows import integrate
+from sb3_policyflow.fpo import FPO
+from sb3_policyflow.policyflow import PolicyFlow
+
+Observations = th.Tensor | dict[str, th.Tensor]
+ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO)
+
+
+class NormalizeObservation(nn.Module):
+    """What ``VecNormalize`` does to an observation, with its statistics as they are now.
+
+    clip((o - mean) / sqrt(var + epsilon), -clip_obs, clip_obs)    in double precision, as there
+
+    :param normalize: The wrapper.
+    :param key: Which of the observations, if they are a dictionary.
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, normalize: VecNormalize, key: str | None = None) -> None:
+        super().__init__()
+        statistics: Any = normalize.obs_rms if key is None else normalize.obs_rms[key]
+        self.register_buffer("mean", th.as_tensor(statistics.mean))
+        self.register_buffer("std", th.as_tensor(np.sqrt(statistics.var + normalize.epsilon)))
+        self.clip = float(normalize.clip_obs)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Normalised observations in single precision, of the same shape."""
+        normalised = (observations.double() - self.mean) / self.std
+        return normalised.clamp(-self.clip, self.clip).float()
+
+
+class ActionModule(nn.Module):
+    """The way from observations to actions, as ``predict(deterministic=True)`` goes it.
+
+    Normalisation, preprocessing, the flow's solver steps one after another, and the bounds of the
+    actions: tensors in, tensors out, nothing drawn at random.
+
+    :param policy: The policy, of which a copy is taken.
+    :param normalize: The environment's ``VecNormalize``, if it has one.
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(
+        self, policy: FlowActorCriticPolicy, normalize: VecNormalize | None = None
+    ) -> None:
+        super().__init__()
+        self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
+        self.policy.set_training_mode(False)
+        self.normalisers = nn.ModuleDict(_normalisers(self.policy.observation_space, normalize))
+        box = self.policy.action_space
+        assert isinstance(box, spaces.Box)
+        self.register_buffer("low", th.as_tensor(box.low, dtype=th.float32))
+        self.register_buffer("high", th.as_tensor(box.high, dtype=th.float32))
+
+    def forward(self, observations: Observations, latents: th.Tensor | None = None) -> th.Tensor:
+        """Act.
+
+        :param observations: As the environment gives them, images with their channels first: a
+            tensor (n, ...), or a dictionary of them.
+        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
+        :return: Actions within their bounds, shape (n, *action shape).
+        """
+        features = self.policy.actor_features(self._normalised(observations))
+        actions = self._flow(features, latents).reshape(-1, *self.low.shape)
+        if self.policy.squash_output:
+            return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+        return actions.clamp(self.low, self.high)
+
+    def _normalised(self, observations: Observations) -> Observations:
+        if isinstance(observations, dict):
+            return {
+                key: self.normalisers[key](values) if key in self.normalisers else values
+                for key, values in observations.items()
+            }
+        return self.normalisers["all"](observations) if self.normalisers else observations
+
+    def _flow(self, features: th.Tensor, latents: th.Tensor | None) -> th.Tensor:
+        policy = self.policy
+        if not isinstance(policy, OdeFlowPolicy):
+            return policy.sample_actions(features, deterministic=True)[0]
+        if latents is None:
+            latents = features.new_zeros(features.shape[0], policy.action_dim)
+        return integrate(
+            lambda points, time: policy.velocity(points, time, features),
+            latents,
+            n_steps=policy.n_flow_steps,
+            solver=policy.solver,
+            end_time=policy.path.end_time,
+        )
+
+    def example(self, latents: bool = False) -> tuple[Any, ...]:
+        """Arguments of :meth:`forward` for a batch of two.
+
+        :param latents: Whether to include some.
+        :raises ValueError: If the policy has none to give.
+        """
+        space = self.policy.observation_space
+        if isinstance(space, spaces.Dict):
+            observations: Any = {key: self._zeros(key, part) for key, part in space.items()}
+        else:
+            observations = self._zeros("all", space)
+        if not latents:
+            return (observations,)
+        if not isinstance(self.policy, OdeFlowPolicy):
+            raise ValueError(
+                f"{type(self.policy).__name__} draws noise in every step, so its latents alone do "
+                "not decide the action: leave them out."
+            )
+        return observations, th.zeros(2, self.policy.action_dim)
+
+    def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
+        """What the environment gives: normalised observations have been floats before."""
+        assert space.shape is not None
+        dtype = np.float32 if key in self.normalisers else space.dtype
+        return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype))
+
+
+def _normalisers(
+    space: spaces.Space[Any], normalize: VecNormalize | None
+) -> dict[str, NormalizeObservation]:
+    if normalize is None or not normalize.norm_obs:
+        return {}
+    if isinstance(space, spaces.Dict):
+        keys = normalize.norm_obs_keys or []
+        return {key: NormalizeObservation(normalize, key) for key in keys}
+    return {"all": NormalizeObservation(normalize)}
+
+
+def export(
+    policy: FlowActorCriticPolicy,
+    path: str | Path,
+    normalize: VecNormalize | None = None,
+    latents: bool = False,
+) -> None:
+    """Write a policy to a file that runs without this package.
+
+    ``.onnx`` is a graph for onnxruntime and others, with one input for each observation, named as
+    in a Dict space or else "observation", and perhaps "latents"; its output is "actions". ``.pt2``
+    is a program for ``torch.export.load``. Any number of observations can be given at once.
+
+    :param policy: The policy, ``model.policy``.
+    :param path: The file, which ends in ".onnx" or ".pt2".
+    :param normalize: The environment's ``VecNormalize``, if it has one: then the file takes
+        observations that are not normalised yet.
+    :param latents: Whether latents z, shape (n, action_dim), are an input; they are 0 otherwise.
+    :raises ValueError: If the file is to be of another kind, or the policy has no latents to give.
+    """
+    path = Path(path)
+    if path.suffix not in (".onnx", ".pt2"):
+        raise ValueError(f"The file must end in '.onnx' or '.pt2', got {path.name!r}.")
+    module = ActionModule(policy, normalize).eval()
+    example = module.example(latents)
+    with th.no_grad():
+        program = th.export.export(module, example, dynamic_shapes=_any_batch(example))
+    if path.suffix == ".pt2":
+        th.export.save(program, path)
+    else:
+        _write_onnx(program, example, path)
+
+
+def _any_batch(example: tuple[Any, ...]) -> tuple[Any, ...]:
+    """That the first axis of every input may have any size."""
+    batch = {0: th.export.Dim.DYNAMIC}
+    return tuple(
+        dict.fromkeys(part, batch) if isinstance(part, dict) else batch for part in example
+    )
+
+
+def _write_onnx(program: th.export.ExportedProgram, example: tuple[Any, ...], path: Path) -> None:
+    observations = example[0]
+    names = list(observations) if isinstance(observations, dict) else ["observation"]
+    th.onnx.export(
+        program,
+        f=path,
+        input_names=[*names, "latents"][: len(names) + len(example) - 1],
+        output_names=["actions"],
+        dynamo=True,
+        external_data=False,
+        verbose=False,
+    )
+
+
+def load_policy(path: str | Path) -> FlowActorCriticPolicy:
+    """The policy of a saved model, whichever algorithm trained it.
+
+    :param path: The model's zip file.
+    :raises ValueError: If no algorithm of this package trained it.
+    """
+    data, _, _ = load_from_zip_file(path, device="cpu")
+    policy_class = (data or {}).get("policy_class", object)
+    for algorithm in ALGORITHMS:
+        if issubclass(policy_class, algorithm.policy_base):
+            return algorithm.load(path, device="cpu").policy
+    raise ValueError(
+        f"{path} holds a {policy_class.__name__}, which is no flow policy: export it as "
+        "Stable-Baselines3 documents."
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Export a policy from the command line.
+
+    :param arguments: The command line's arguments; those of the process if not given.
+    """
+    parser = argparse.ArgumentParser(prog="python -m sb3_policyflow.export", description=__doc__)
+    parser.add_argument("model", help="the model's zip file")
+    parser.add_argument("output", help="the file to write, .onnx or .pt2")
+    parser.add_argument("--vecnormalize", metavar="PKL", help="what VecNormalize.save wrote")
+    parser.add_argument("--latents", action="store_true", help="make the latents an input")
+    options = parser.parse_args(arguments)
+    normalize = None
+    if options.vecnormalize is not None:
+        normalize = pickle.loads(Path(options.vecnormalize).read_bytes())
+    export(load_policy(options.model), options.output, normalize, options.latents)
+    sys.stdout.write(f"Wrote {options.output}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""The paper's MultiGoal figure."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_policyflow.benchmark import multigoal
+from sb3_policyflow.benchmark.cell import train_cell
+from sb3_policyflow.benchmark.results import Cell, load_results
+
+FAST = {"n_envs": 8, "n_steps": 8, "batch_size": 64, "n_epochs": 1}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds of two panels, hardly trained."""
+    path = tmp_path_factory.mktemp("multigoal")
+    for name in ("d-uniform", "c-fpo"):
+        panel = multigoal.PANELS[name]
+        for seed in (0, 1):
+            train_cell(
+                Cell(
+                    name,
+                    panel.algo,
+                    multigoal.ENV,
+                    seed,
+                    64,
+                    {**panel.hyperparams, **FAST},
+                    n_evaluations=1,
+                    n_episodes=2,
+                    n_trajectories=50,
+                ),
+                path,
+            )
+    return path
+
+
+def test_panels_are_the_papers() -> None:
+    cells = multigoal.panel_cells([0, 1, 2], steps=1000, n_evaluations=1, n_episodes=1)
+    assert len(cells) == 18
+    assert {cell.algo for cell in cells} == {"ppo", "dppo", "fpo", "policyflow"}
+    assert len({cell.path(Path(), ".json") for cell in cells}) == 18
+    assert [panel.title[:3] for panel in multigoal.PANELS.values()] == [
+        f"({letter})" for letter in "abcdef"
+    ]
+
+
+def test_figure_and_table(folder: Path) -> None:
+    multigoal.draw(folder, load_results(folder))
+    assert (folder / "multigoal.png").stat().st_size > 20_000
+    table = (folder / "multigoal.md").read_text()
+    assert "| (c) FPO | 2 |" in table
+    assert "| (d) PolicyFlow, uniform noise | 2 |" in table
+
+
+def test_kept_trajectories(folder: Path) -> None:
+    [result] = [r for r in load_results(folder) if (r.cell.name, r.cell.seed) == ("c-fpo", 1)]
+    trajectories = multigoal.load_trajectories(result.cell, folder)
+    assert trajectories.positions.shape == (50, 51, 2)
+    np.testing.assert_array_equal(trajectories.positions[:, 0], np.zeros((50, 2)))
+    goals = result.summary["goals"]
+    assert sum(goals["counts"]) + goals["n_missed"] == 50
+    assert goals["mean_return"] == pytest.approx(float(trajectories.returns.mean()), rel=1e-4)
+
+
+def test_hyperparameters_of_a_panel_reach_the_training(folder: Path) -> None:
+    [result] = [r for r in load_results(folder) if (r.cell.name, r.cell.seed) == ("d-uniform", 0)]
+    assert result.summary["hyperparams"]["uniform_noise_coef"] == "0.05"
+    assert result.summary["hyperparams"]["brownian_coef"] == "0.0"
+    # Those of the YAML file stay.
+    assert result.summary["hyperparams"]["desired_kl"] == "0.01"

@@ -1,0 +1,169 @@
+"""Benchmarks run, continue, and are summed up, by the commands that users type."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.benchmark import costs
+from sb3_policyflow.benchmark.__main__ import main
+from sb3_policyflow.benchmark.evaluation import evaluate, modes
+from sb3_policyflow.benchmark.results import Cell, Result, load_results
+from sb3_policyflow.benchmark.table import improvement_table, results_table
+
+
+def benchmark(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sb3_policyflow.benchmark", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    settings = ["--envs", "Pendulum-v1", "--steps", "10", "--evaluations", "1", "--episodes", "2"]
+    return benchmark("run", *settings, "--out", str(folder), "--algos", *arguments)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of two algorithms."""
+    path = tmp_path_factory.mktemp("results")
+    outcome = run(path, "fpo", "ppo", "--jobs", "2")
+    assert outcome.returncode == 0, outcome.stderr
+    assert "2/2" in outcome.stderr
+    return path
+
+
+def test_what_is_written(folder: Path) -> None:
+    files = sorted(str(path.relative_to(folder)) for path in folder.glob("*/*/*"))
+    names = [f"Pendulum-v1/seed-0.{suffix}" for suffix in ("csv", "json")]
+    assert files == [f"{algo}/{name}" for algo in ("fpo", "ppo") for name in names]
+    fpo, ppo = load_results(folder)
+    assert [list(r.summary["final"]) for r in (fpo, ppo)] == [
+        ["stochastic", "latent-only", "deterministic"],
+        ["stochastic", "deterministic"],
+    ]
+    # One rollout of 8 times 512 steps, ten epochs in minibatches of 128, eight probes.
+    assert fpo.summary["timesteps"] == 4096
+    assert fpo.summary["gradient_steps"] == 320
+    assert fpo.summary["network_evaluations"] == {"acting": 40960, "updating": 320 * 128 * 8}
+    assert fpo.summary["hyperparams"]["clip_range"] == "0.05"
+    assert fpo.summary["versions"]["torch"]
+    assert fpo.summary["seconds"]["training"] > 0
+    assert fpo.returns("stochastic")[1] == [fpo.final_return("stochastic")]
+    assert -2000 < ppo.final_return("deterministic") < 0  # type: ignore[operator]
+
+
+def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
+    before = (folder / "ppo/Pendulum-v1/seed-0.json").stat().st_mtime_ns
+    # What a killed run leaves behind does not count.
+    (folder / "ppo/Pendulum-v1/seed-1.json.partial").write_text("{")
+    outcome = run(folder, "ppo", "--seeds", "0", "1")
+    assert outcome.returncode == 0, outcome.stderr
+    assert (folder / "ppo/Pendulum-v1/seed-0.json").stat().st_mtime_ns == before
+    assert len(load_results(folder)) == 3
+
+
+def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--algos", "fpo", "--envs", "Pendulum-v1", "--steps", "11", "--out", str(folder)]
+    assert main(["run", *settings]) == 2
+    assert "was made with other settings" in capsys.readouterr().err
+
+
+def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
+    outcome = benchmark(
+        "run", "--algos", "fpo", "--envs", "NoSuch-v0", "--steps", "10", "--out", str(tmp_path)
+    )
+    assert outcome.returncode == 1
+    assert "failed: fpo NoSuch-v0 seed 0" in outcome.stderr
+    assert "NoSuch" in (tmp_path / "fpo/NoSuch-v0/seed-0.log").read_text()
+
+
+def test_table_and_plot(folder: Path, tmp_path: Path) -> None:
+    assert main(["table", str(folder), "--out", str(tmp_path / "table.md")]) == 0
+    assert "| Pendulum-v1, 10 steps | fpo | 1 |" in (tmp_path / "table.md").read_text()
+    assert main(["plot", str(folder), "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    assert (tmp_path / "improvement.png").stat().st_size > 5_000
+
+
+def test_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["table", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("No results in")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), (["nonsense"], 2), ([], 0)])
+def test_usage(arguments: list[str], code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_of:
+        main(arguments)
+    assert exit_of.value.code == code
+    written = capsys.readouterr()
+    assert "multigoal" in written.out + written.err
+
+
+def result(name: str, seed: int, value: float) -> Result:
+    summary: dict[str, Any] = {
+        "final": {"stochastic": {"mean_return": value}},
+        "gradient_steps": 1000,
+        "network_evaluations": {"acting": 1e6, "updating": 2e6},
+        "seconds": {"training": 90.0},
+    }
+    return Result(Cell(name, name, "Pendulum-v1", seed, 100), summary, [])
+
+
+def test_tables_by_hand() -> None:
+    results = [result("ours", seed, value) for seed, value in enumerate([1.0, 3.0, 5.0, 99.0])]
+    results += [result("theirs", seed, value) for seed, value in enumerate([0.0, 2.0, 4.0])]
+    ours, theirs = results_table(results).splitlines()[2:]
+    assert ours.startswith("| Pendulum-v1, 1e+02 steps | ours | 4 | 4 [")
+    assert ours.endswith("| - | - | 1,000 | 1.0 M / 2.0 M | 1.5 |")
+    assert "| theirs | 3 |" in theirs
+    assert "| ours | theirs | 0.75 [" in improvement_table(results)
+
+
+def test_results_survive_saving(tmp_path: Path) -> None:
+    row = {"timesteps": 10.0, "mode": "stochastic", "mean_return": -1.5, "std_return": 0.5}
+    saved = Result(Cell("a", "ppo", "Env-v0", 3, 10, {"n_envs": 2}), {"final": {}}, [row])
+    row |= {"mean_length": 7.0, "n_episodes": 4.0}
+    saved.save(tmp_path)
+    assert load_results(tmp_path) == [saved]
+    assert saved.cell.is_done(tmp_path)
+    assert json.loads((tmp_path / "a/Env-v0/seed-3.json").read_text())["cell"]["algo"] == "ppo"
+
+
+def test_evaluation_leaves_the_training_alone() -> None:
+    """Neither the random draws nor the running statistics of the training move."""
+    env = VecNormalize(make_vec_env("Pendulum-v1", 2))
+    evaluation = VecNormalize(make_vec_env("Pendulum-v1", 2), training=False, norm_reward=False)
+    model = FPO("MlpPolicy", env, n_steps=32, batch_size=32, seed=0).learn(64)
+    mean = env.obs_rms.mean.copy()  # type: ignore[union-attr]
+    state = np.random.get_state()[1].copy()  # type: ignore[index,union-attr]
+    found = [evaluate(model, evaluation, mode, 2)["mean_return"] for mode in modes(model)]
+    again = [evaluate(model, evaluation, mode, 2)["mean_return"] for mode in modes(model)]
+    assert found == again
+    assert found[0] == found[1] != found[2]  # no noise but the latents'
+    assert not model.policy.random_latents
+    np.testing.assert_array_equal(env.obs_rms.mean, mean)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(evaluation.obs_rms.mean, mean)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(np.random.get_state()[1], state)  # type: ignore[index]
+
+
+def test_costs() -> None:
+    small: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
+    flow = PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small)
+    assert costs.evaluations_per_action(flow) == 24
+    assert costs.evaluations_per_sample(flow) == 6
+    chain = DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small)
+    assert costs.evaluations_per_action(chain) == 10
+    assert costs.evaluations_per_sample(chain) == 4
+    steps = costs.GradientSteps(chain)
+    chain.learn(32)
+    assert steps.count == 4
+    assert costs.network_evaluations(chain, steps.count) == {"acting": 320, "updating": 4 * 8 * 4}

@@ -1,0 +1,212 @@
+"""Laws of DPPO's objective."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from torch.distributions import Normal
+
+from sb3_policyflow import DPPO
+from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
+from sb3_policyflow.dppo.policies import DPPORecord
+
+N_SAMPLES = 64
+
+
+def collected(**options: Any) -> tuple[DPPO, FlowRolloutBufferSamples]:
+    """A model with a rollout in its buffer."""
+    model = DPPO(
+        "MlpPolicy",
+        "Pendulum-v1",
+        n_steps=N_SAMPLES,
+        batch_size=16,
+        n_epochs=1,
+        seed=0,
+        policy_kwargs={"initialisation": "glorot"},
+        **options,
+    )
+    model.learn(N_SAMPLES)
+    model.collect_rollouts(
+        model.get_env(),  # type: ignore[arg-type]
+        model._init_callback(None),
+        model.rollout_buffer,
+        N_SAMPLES,
+    )
+    return model, model._rollout()
+
+
+def terms(model: DPPO, batch: FlowRolloutBufferSamples) -> Any:
+    return model._policy_terms(batch, model.policy.actor_features(batch.observations), None)
+
+
+def perturb(model: DPPO, scale: float = 0.02) -> None:
+    with th.no_grad():
+        for parameter in model.policy.velocity.parameters():
+            parameter += scale * th.randn_like(parameter)
+
+
+@pytest.mark.parametrize("process", ["ddpm", "flow"])
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_log_ratios_are_zero_at_equal_weights(process: str, reduction: str) -> None:
+    model, rollout = collected(process=process, log_prob_reduction=reduction)
+    for batch in model.rollout_buffer.minibatches(rollout, 16):
+        result = terms(model, batch)
+        assert result.log_ratio.shape == (16, 10)
+        th.testing.assert_close(result.log_ratio, th.zeros(16, 10), atol=2e-4, rtol=0)
+        assert result.kl.item() < 1e-8
+
+
+@pytest.mark.parametrize("process", ["ddpm", "flow"])
+def test_log_prob_of_the_chain_is_that_of_its_gaussians(process: str) -> None:
+    model, rollout = collected(process=process, log_prob_clamp=None, log_prob_reduction="sum")
+    record: DPPORecord = rollout.record
+    perturb(model)
+    policy = model.policy
+    with th.no_grad():
+        features = policy.actor_features(rollout.observations)
+        means = policy.trained_means(record.points[:, :-1], features)
+        expected = th.zeros(N_SAMPLES)
+        for step in range(10):
+            points = record.points[:, step]
+            outputs = policy.velocity(points, th.tensor(step / 10), features)
+            mean = policy.process.means(points, outputs, step)
+            std = max(policy.process.stds[step].item(), 0.1)
+            expected += Normal(mean, std).log_prob(record.points[:, step + 1]).sum(-1)
+    log_probs = model._log_probs(record, means)
+    th.testing.assert_close(log_probs.sum(-1), expected, atol=1e-3, rtol=1e-4)
+    old = model._log_probs(record, record.means)
+    th.testing.assert_close(terms(model, rollout).log_ratio, log_probs - old)
+
+
+def test_one_step_is_a_gaussian_policy_at_the_floor_std() -> None:
+    options = {"n_denoising_steps": 1, "log_prob_clamp": None, "log_prob_reduction": "sum"}
+    model, rollout = collected(min_sampling_std=0.3, min_log_prob_std=0.3, **options)
+    record: DPPORecord = rollout.record
+    assert model.policy.process.stds.tolist() == [0.0]
+    noise = record.points[:, 1] - record.means[:, 0]
+    assert noise.std().item() == pytest.approx(0.3, rel=0.25)
+    th.testing.assert_close(rollout.actions, record.points[:, 1].clamp(-1, 1))
+    perturb(model)
+    with th.no_grad():
+        features = model.policy.actor_features(rollout.observations)
+        means = model.policy.trained_means(record.points[:, :1], features)[:, 0]
+    new, old = Normal(means, 0.3), Normal(record.means[:, 0], 0.3)
+    action = record.points[:, 1]
+    expected = (new.log_prob(action) - old.log_prob(action)).sum(-1)
+    th.testing.assert_close(terms(model, rollout).log_ratio[:, 0], expected, atol=1e-4, rtol=1e-4)
+
+
+def test_divergence_is_that_of_the_steps() -> None:
+    model, rollout = collected()
+    perturb(model)
+    record, policy = rollout.record, model.policy
+    with th.no_grad():
+        features = policy.actor_features(rollout.observations)
+        means = policy.trained_means(record.points[:, :-1], features)
+    stds = policy.log_prob_stds.unsqueeze(-1)
+    divergence = th.distributions.kl_divergence(Normal(record.means, stds), Normal(means, stds))
+    th.testing.assert_close(terms(model, rollout).kl, divergence.sum((1, 2)).mean())
+
+
+def test_log_probs_are_clamped_before_they_are_reduced() -> None:
+    model, _ = collected(process="flow", n_denoising_steps=1)
+    means = th.zeros(1, 1, 2)
+    points = th.stack([th.zeros(1, 2), th.tensor([[0.0, 9.0]])], dim=1)
+    # log N(0; 0, 0.1^2) = 1.38 stays, that of 9 is far below -5.
+    record = DPPORecord(points, means)
+    expected = (Normal(0.0, 0.1).log_prob(th.tensor(0.0)).item() - 5) / 2
+    assert model._log_probs(record, means).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_later_steps_weigh_more_and_are_clipped_later() -> None:
+    model, _ = collected(
+        denoising_gamma=0.5, clip_range_base=0.01, clip_range=0.2, n_denoising_steps=3
+    )
+    clip_ranges = model._clip_range_now()
+    assert isinstance(clip_ranges, th.Tensor)
+    middle = 0.01 + 0.19 * (np.exp(1.5) - 1) / (np.exp(3) - 1)
+    th.testing.assert_close(clip_ranges, th.tensor([0.01, middle, 0.2], dtype=th.float32))
+    objective = model._surrogate(th.full((1, 3), 5.0), th.tensor([2.0]))
+    expected = th.tensor([[0.25 * 1.01, 0.5 * (1 + middle), 1.2]], dtype=th.float32) * 2
+    th.testing.assert_close(objective, expected)
+
+
+def test_a_single_step_has_the_last_clip_range() -> None:
+    model, _ = collected(clip_range_base=0.01, n_denoising_steps=1)
+    assert model._clip_range_now() == pytest.approx(0.2)
+
+
+def test_only_the_last_steps_are_trained() -> None:
+    model, rollout = collected(n_finetuned_steps=4)
+    assert rollout.record.means.shape == (N_SAMPLES, 4, 1)
+    frozen = [value.clone() for value in model.policy.base_velocity.state_dict().values()]
+    model.train()
+    base, trained = model.policy.base_velocity.state_dict(), model.policy.velocity.state_dict()
+    assert all(th.equal(old, new) for old, new in zip(frozen, base.values(), strict=True))
+    assert not th.equal(base["output.weight"], trained["output.weight"])
+    model.policy.freeze_base()
+    base = model.policy.base_velocity.state_dict()
+    assert th.equal(base["output.weight"], trained["output.weight"])
+
+
+def test_only_the_critic_warms_up() -> None:
+    model = DPPO(
+        "MlpPolicy",
+        "Pendulum-v1",
+        n_steps=64,
+        n_epochs=3,
+        n_critic_warmup=2,
+        desired_kl=0.01,
+        ent_coef=0.01,
+        seed=0,
+    )
+    untrained = model.policy.velocity.output.weight.clone()
+    critic = model.policy.value_net.weight.clone()
+    model.learn(2 * 64)
+    assert th.equal(model.policy.velocity.output.weight, untrained)
+    assert not th.equal(model.policy.value_net.weight, critic)
+    assert model.adaptive_learning_rate == 3e-4
+    model.learn(64, reset_num_timesteps=False)
+    assert not th.equal(model.policy.velocity.output.weight, untrained)
+
+
+def test_untrained_policy_stays_off_the_bounds_with_the_identity_skip() -> None:
+    shares = []
+    for identity_skip in (True, False):
+        model = DPPO("MlpPolicy", "Pendulum-v1", identity_skip=identity_skip, seed=0)
+        with th.no_grad():
+            actions, _ = model.policy.sample_actions(th.randn(1000, 3))
+        shares.append((actions.abs() == 1).float().mean().item())
+    assert shares[0] < 0.05
+    assert shares[1] > 0.15
+
+
+class Lopsided(gym.Env[Any, Any]):
+    """Takes actions between 3 and 11."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (1,))
+    action_space = spaces.Box(3.0, 11.0, (2,))
+
+    def __init__(self) -> None:
+        self.seen: list[np.ndarray] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.seen.append(action)
+        return np.zeros(1, dtype=np.float32), 0.0, False, False, {}
+
+
+def test_ddpm_scales_its_actions_to_their_space() -> None:
+    env = Lopsided()
+    model = DPPO("MlpPolicy", env, n_steps=128, batch_size=64).learn(128)
+    seen = np.stack(env.seen)
+    assert seen.min() >= 3
+    assert seen.max() <= 11
+    assert seen.mean() == pytest.approx(7, abs=1)
+    assert np.abs(model.rollout_buffer.actions).max() <= 1

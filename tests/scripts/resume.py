@@ -1,0 +1,94 @@
+"""Trains in a process of its own, wholly or from a checkpoint, and says what came out.
+
+python tests/scripts/resume.py whole  FOLDER ALGORITHM    trains, with a checkpoint half-way
+python tests/scripts/resume.py resume FOLDER ALGORITHM    goes on from that checkpoint
+
+Prints one line: a digest of everything that the rest of the training depends on.
+"""
+
+import hashlib
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
+from sb3_policyflow.common.saving import RandomStates
+from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.fpo import FPO
+from sb3_policyflow.policyflow import PolicyFlow
+
+ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO}
+N_ENVS, N_STEPS, ITERATIONS = 8, 32, 4
+TOTAL = N_ENVS * N_STEPS * ITERATIONS
+HALF = TOTAL // 2
+
+
+def digest(model: Any) -> str:
+    """A hash of parameters, optimiser, learning rate, statistics and random states."""
+    normalize = model.get_vec_normalize_env()
+    optimizer = model.policy.optimizer.state_dict()
+    parts = [
+        *model.policy.state_dict().values(),
+        *(value for state in optimizer["state"].values() for value in state.values()),
+        *(normalize.obs_rms.mean, normalize.obs_rms.var, normalize.ret_rms.var, normalize.returns),
+        *(model._last_obs, model._n_updates, model.num_timesteps, model.adaptive_learning_rate),
+        RandomStates.now(model.device).torch,
+    ]
+    sha = hashlib.sha256()
+    for part in parts:
+        sha.update(np.asarray(part).tobytes())
+    return sha.hexdigest()
+
+
+class EnvStateCheckpoint(RolloutCheckpointCallback):
+    """Keeps the state of the environment beside the model, which MultiGoal alone can tell."""
+
+    def _save(self) -> None:
+        super()._save()
+        environment: Any = self.training_env  # wrappers find it in MultiGoalVecEnv
+        state = pickle.dumps(environment.get_state())
+        path = Path(self.save_path) / f"env_{self.num_timesteps}.pkl"
+        path.write_bytes(state)
+
+
+def whole(folder: Path, algorithm: type[Any]) -> Any:
+    env = VecNormalize(VecMonitor(MultiGoalVecEnv(N_ENVS, seed=3)), gamma=0.9)
+    options = {"brownian_coef": "lin_0.25"} if algorithm is PolicyFlow else {}
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        n_steps=N_STEPS,
+        batch_size=64,
+        n_epochs=2,
+        gamma=0.9,
+        clip_range=lambda progress: 0.1 + 0.1 * progress,
+        desired_kl=1e-4,
+        seed=5,
+        policy_kwargs={"net_arch": [16, 16], "embedding_dim": 8},
+        **options,
+    )
+    checkpoint = EnvStateCheckpoint(
+        HALF // N_ENVS, str(folder), name_prefix="model", save_vecnormalize=True
+    )
+    return model.learn(TOTAL, checkpoint)
+
+
+def resume(folder: Path, algorithm: type[Any]) -> Any:
+    th.rand(3)  # whatever this process has done before
+    inner = VecMonitor(MultiGoalVecEnv(N_ENVS))
+    inner.set_state(pickle.loads((folder / f"env_{HALF}.pkl").read_bytes()))
+    env = VecNormalize.load(str(folder / f"model_vecnormalize_{HALF}_steps.pkl"), inner)
+    model = algorithm.load(folder / f"model_{HALF}_steps", env=env, force_reset=False)
+    return model.learn(model.remaining_timesteps, reset_num_timesteps=False)
+
+
+if __name__ == "__main__":
+    th.set_num_threads(1)
+    mode, where, name = sys.argv[1:]
+    train = {"whole": whole, "resume": resume}[mode]
+    sys.stdout.write(digest(train(Path(where), ALGORITHMS[name])) + "\n")

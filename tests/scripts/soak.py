@@ -1,0 +1,120 @@
+"""Trains for long and watches memory, file handles and speed.
+
+python tests/scripts/soak.py [MINUTES] [FOLDER]
+
+Prints a line every tenth of the time, and in the end how memory grew per million steps (a straight
+line through the second half), how many file handles there are, and the speed of both halves.
+"""
+
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from sb3_policyflow import PolicyFlow
+from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
+from sb3_policyflow.diagnostics import FlowDiagnosticsCallback
+from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+
+N_ENVS, N_STEPS = 256, 24
+
+
+class Sample(NamedTuple):
+    """One look at the process: seconds, timesteps, resident bytes, open files."""
+
+    seconds: float
+    timesteps: int
+    memory: int
+    handles: int
+
+
+class Watch(BaseCallback):
+    """Looks at the process after each update, and ends training when the time is over."""
+
+    def __init__(self, minutes: float) -> None:
+        super().__init__()
+        self.seconds = 60 * minutes
+        self.samples: list[Sample] = []
+        self.start = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        return time.perf_counter() - self.start < self.seconds
+
+    def _on_rollout_start(self) -> None:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        self.samples.append(
+            Sample(
+                time.perf_counter() - self.start,
+                self.num_timesteps,
+                pages * os.sysconf("SC_PAGE_SIZE"),
+                len(os.listdir("/proc/self/fd")),
+            )
+        )
+        if self.samples[-1].seconds > self.seconds / 10 * getattr(self, "n_said", 0):
+            self.n_said = getattr(self, "n_said", 0) + 1
+            say(self.samples[-1])
+
+
+def say(sample: Sample) -> None:
+    sys.stdout.write(
+        f"{sample.seconds:8.0f} s {sample.timesteps:12d} steps {sample.memory / 2**20:8.1f} MiB "
+        f"{sample.handles:4d} handles\n"
+    )
+    sys.stdout.flush()
+
+
+def speed(samples: list[Sample]) -> float:
+    """Timesteps a second between the first and the last sample."""
+    first, last = samples[0], samples[-1]
+    return (last.timesteps - first.timesteps) / (last.seconds - first.seconds)
+
+
+def summary(samples: list[Sample]) -> str:
+    """Growth of memory, handles, and the speed of both halves."""
+    half = len(samples) // 2
+    late = np.array(samples[half:], dtype=np.float64)
+    slope = np.polyfit(late[:, 1] / 1e6, late[:, 2] / 2**20, 1)[0]
+    return (
+        f"{samples[-1].timesteps} steps: memory {slope:+.3f} MiB per million steps, handles "
+        f"{samples[half].handles} to {samples[-1].handles}, {speed(samples[:half]):.0f} and then "
+        f"{speed(samples[half:]):.0f} steps/s"
+    )
+
+
+def main(minutes: float, folder: str) -> None:
+    """Train with everything on that could leak: logs, checkpoints, diagnostics."""
+    th.set_num_threads(1)
+    env = VecNormalize(VecMonitor(MultiGoalVecEnv(N_ENVS, seed=0)))
+    model = PolicyFlow(
+        "MlpPolicy",
+        env,
+        n_steps=N_STEPS,
+        batch_size=1536,
+        n_epochs=2,
+        desired_kl=0.01,
+        brownian_coef=0.25,
+        seed=0,
+    )
+    model.set_logger(configure(folder, ["csv", "json", "tensorboard"]))
+    watch = Watch(minutes)
+    checkpoint = RolloutCheckpointCallback(20 * N_STEPS, folder, save_vecnormalize=True)
+    diagnostics = FlowDiagnosticsCallback(every=10, n_samples=256)
+    model.learn(10**9, [watch, checkpoint, diagnostics])
+    sys.stdout.write(summary(watch.samples) + "\n")
+
+
+if __name__ == "__main__":
+    time_limit = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
+    if len(sys.argv) > 2:
+        main(time_limit, sys.argv[2])
+    else:
+        with tempfile.TemporaryDirectory() as temporary:
+            main(time_limit, temporary)

@@ -1,0 +1,179 @@
+"""Exported files act as the policy does, and need nothing of this package."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_policyflow import PolicyFlow
+from sb3_policyflow.export import ActionModule, export, main
+from sb3_policyflow.fpo import FPO
+
+ort = pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+
+SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, "n_flow_steps": 2}
+NETS = {"net_arch": [16], "embedding_dim": 8, "initialisation": "glorot"}
+
+
+class Robot(gym.Env[Any, Any]):
+    """A camera, joints far from the origin, a counter, a mode and switches; actions 2 by 2."""
+
+    observation_space = spaces.Dict(
+        {
+            "camera": spaces.Box(0, 255, (36, 36, 3), np.uint8),
+            "joints": spaces.Box(-1e3, 1e3, (3,)),
+            "mode": spaces.Discrete(3),
+            "switches": spaces.MultiBinary(2),
+            "doors": spaces.MultiDiscrete([2, 3]),
+        }
+    )
+    action_space = spaces.Box(
+        np.array([[-1, 0], [0, -3]], np.float32), np.array([[1, 0.5], [2, 3]], np.float32)
+    )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), float(action.sum()), False, False, {}
+
+
+def images() -> gym.Env[Any, Any]:
+    return FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=False)
+
+
+def trained(algorithm: type[Any], policy: str, env: VecEnv | str, **options: Any) -> Any:
+    return algorithm(policy, env, policy_kwargs=NETS, seed=0, **{**SMALL, **options}).learn(64)
+
+
+def raw_and_normalised(env: VecNormalize) -> tuple[Any, Any]:
+    """Observations as the environment gives them, and as the policy sees them."""
+    env.training = False
+    normalised = env.reset()
+    return env.get_original_obs(), normalised
+
+
+def run_onnx(path: Path, observations: Any, **more: np.ndarray) -> np.ndarray:
+    session = ort.InferenceSession(path)
+    inputs = observations if isinstance(observations, dict) else {"observation": observations}
+    (actions,) = session.run(["actions"], {**inputs, **more})
+    return np.asarray(actions)
+
+
+@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env("Pendulum-v1", 3))
+    model = trained(algorithm, "MlpPolicy", env, solver="midpoint")
+    export(model.policy, tmp_path / "policy.onnx", normalize=env)
+    raw, normalised = raw_and_normalised(env)
+    expected, _ = model.predict(normalised, deterministic=True)
+    np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", raw), expected, atol=1e-5)
+    one = run_onnx(tmp_path / "policy.onnx", raw[:1])
+    np.testing.assert_allclose(one, expected[:1], atol=1e-5)
+    assert expected.std() > 0
+
+
+@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
+    model = trained(algorithm, "CnnPolicy", make_vec_env(images, 2))
+    export(model.policy, tmp_path / "policy.onnx")
+    pictures = np.stack([model.observation_space.sample() for _ in range(3)])
+    expected, _ = model.predict(pictures, deterministic=True)
+    np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", pictures), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env(Robot, 3), norm_obs_keys=["joints"])
+    model = trained(algorithm, "MultiInputPolicy", env)
+    export(model.policy, tmp_path / "policy.onnx", normalize=env)
+    raw, normalised = raw_and_normalised(env)
+    expected, _ = model.predict(normalised, deterministic=True)
+    raw["camera"] = raw["camera"].transpose(0, 3, 1, 2)
+    raw = {key: values.astype(model.observation_space[key].dtype) for key, values in raw.items()}
+    actions = run_onnx(tmp_path / "policy.onnx", raw)
+    assert actions.shape == (3, 2, 2)
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("path", "solver"), [("trigflow", "rk4"), ("rectified", "ab2"), ("rectified", "heun")]
+)
+def test_latents_are_carried_as_the_policy_carries_them(
+    path: str, solver: str, tmp_path: Path
+) -> None:
+    model = trained(PolicyFlow, "MlpPolicy", "Pendulum-v1", path=path, solver=solver)
+    export(model.policy, tmp_path / "policy.onnx", latents=True)
+    obs = np.stack([model.observation_space.sample() for _ in range(5)])
+    latents = np.random.randn(5, 1).astype(np.float32)
+    with th.no_grad():
+        features = model.policy.actor_features(th.as_tensor(obs))
+        endpoints = model.policy.carry(th.as_tensor(latents), features).clamp(-2, 2)
+    actions = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
+    np.testing.assert_allclose(actions, endpoints, atol=1e-5)
+
+
+WITHOUT_THIS_PACKAGE = """
+import sys
+sys.modules.update(sb3_policyflow=None, stable_baselines3=None)
+import numpy as np
+if sys.argv[1] == "onnx":
+    import onnxruntime
+    session = onnxruntime.InferenceSession("policy.onnx")
+    (actions,) = session.run(None, {"observation": np.load("obs.npy")})
+else:
+    import torch
+    program = torch.export.load("policy.pt2").module()
+    actions = program(torch.as_tensor(np.load("obs.npy"))).detach().numpy()
+np.save("actions.npy", actions)
+"""
+
+
+@pytest.mark.parametrize("kind", ["onnx", "pt2"])
+def test_command_line_writes_files_that_load_without_this_package(
+    kind: str, tmp_path: Path
+) -> None:
+    env = VecNormalize(make_vec_env("Pendulum-v1", 3))
+    model = trained(PolicyFlow, "MlpPolicy", env)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "stats.pkl"))
+    raw, normalised = raw_and_normalised(env)
+    np.save(tmp_path / "obs.npy", raw)
+    output = tmp_path / f"policy.{kind}"
+    stats = str(tmp_path / "stats.pkl")
+    main([str(tmp_path / "model.zip"), str(output), "--vecnormalize", stats])
+    subprocess.run(
+        [sys.executable, "-c", WITHOUT_THIS_PACKAGE, kind], cwd=tmp_path, check=True, timeout=300
+    )
+    expected, _ = model.predict(normalised, deterministic=True)
+    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=1e-5)
+
+
+def test_the_module_itself_and_the_bounds_of_actions() -> None:
+    model = trained(FPO, "MlpPolicy", "Pendulum-v1")
+    with th.no_grad():
+        model.policy.velocity.output.bias.fill_(100.0)
+    obs = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(4)]))
+    assert (ActionModule(model.policy)(obs) == 2.0).all()
+
+
+def test_what_cannot_be_exported(tmp_path: Path) -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1")
+    with pytest.raises(ValueError, match=r"must end in '\.onnx' or '\.pt2', got 'policy\.pb'"):
+        export(model.policy, "policy.pb")
+    PPO("MlpPolicy", "Pendulum-v1").save(tmp_path / "ppo.zip")
+    with pytest.raises(ValueError, match="which is no flow policy"):
+        main([str(tmp_path / "ppo.zip"), str(tmp_path / "policy.onnx")])
