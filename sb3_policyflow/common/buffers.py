@@ -101,16 +101,17 @@ class RecordBufferMixin(RolloutBuffer):
         n_samples = self.buffer_size * self.n_envs
         order = np.random.permutation(n_samples)
         # SB3 numbers transitions environment by environment, ``samples`` step by step.
-        indices: th.Tensor | None = th.as_tensor(
+        indices = th.as_tensor(
             order % self.buffer_size * self.n_envs + order // self.buffer_size, device=self.device
         )
         size = batch_size or n_samples
+        parts = [slice(start, start + size) for start in range(0, n_samples, size)]
         if size_in_bytes(samples) <= SHUFFLED_AT_ONCE:
-            # One gather of all rows, of which minibatches are views, is faster than many of few.
-            samples, indices = rows(samples, indices), None
-        for start in range(0, n_samples, size):
-            chosen = slice(start, start + size)
-            yield rows(samples, chosen if indices is None else indices[chosen])
+            # Many views of one shuffled copy are faster than many gathers of few rows.
+            shuffled = rows(samples, indices)
+            yield from (rows(shuffled, part) for part in parts)
+        else:
+            yield from (rows(samples, indices[part]) for part in parts)
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """Go through the rollout once in minibatches, in random order."""

@@ -41,6 +41,8 @@ class RolloutVecEnv(VecEnvWrapper):
         super().__init__(venv)
         self._timestep = first_timestep
         self._rewards = np.zeros(0)
+        self._innermost = self.unwrapped
+        self._normalize = unwrap_vec_normalize(self)
 
     def reset(self) -> VecEnvObs:
         """Reset the environments."""
@@ -63,7 +65,7 @@ class RolloutVecEnv(VecEnvWrapper):
         :raises ValueError: If an observation has not the shape of its space.
         :raises EOFError: If a worker process of the environment has died.
         """
-        wait_for_workers(self.unwrapped)
+        wait_for_workers(self._innermost)
         obs, rewards, dones, infos = self.venv.step_wait()
         self.check_rewards(rewards)
         self.check_observations(obs)
@@ -75,7 +77,7 @@ class RolloutVecEnv(VecEnvWrapper):
 
         :raises FloatingPointError: If one is not.
         """
-        normalize = unwrap_vec_normalize(self)
+        normalize = self._normalize
         if normalize is not None and not np.isfinite(rewards).all():
             # It has spread one environment's number over all of them.
             self._check_finite("reward", normalize.get_original_reward())
@@ -92,7 +94,7 @@ class RolloutVecEnv(VecEnvWrapper):
         :raises FloatingPointError: If one is not finite.
         :raises ValueError: If one has not the shape of its space.
         """
-        normalize = unwrap_vec_normalize(self) if indices is None else None
+        normalize = self._normalize if indices is None else None
         for name, values, space in _named(kind, obs, self.observation_space):
             self._check_shape(name, values, space)
             if normalize is not None and not np.isfinite(values).all():

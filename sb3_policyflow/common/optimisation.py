@@ -32,7 +32,7 @@ def make_optimizer(
     if optimizer_class in (th.optim.Adam, th.optim.AdamW) and is_open:
         parameters = list(parameters)
         try:
-            return optimizer_class(parameters, fused=True, **arguments)  # type: ignore[call-arg]
+            return optimizer_class(parameters, fused=True, **arguments)
         except RuntimeError:
             pass  # torch has no such implementation for this device
     return optimizer_class(parameters, **arguments)
@@ -52,7 +52,7 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math
     if module is not None and in_memory(grads):
         sizes = np.array([grad.numel() for grad in grads])
         return float(module.clip(addresses(grads), sizes, max_norm))
-    norm = th.cat([grad.reshape(-1) for grad in grads]).norm().item()
+    norm: float = th.cat([grad.reshape(-1) for grad in grads]).norm().item()
     factor = max_norm / (norm + 1e-6)
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)

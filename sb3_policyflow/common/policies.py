@@ -167,6 +167,11 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         features = self.extract_features(obs)
         return features if isinstance(features, tuple) else (features, features)
 
+    def set_training_mode(self, mode: bool) -> None:
+        """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
+        if not is_in_mode(self, mode):
+            super().set_training_mode(mode)
+
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
         network = self._critic.of(self)
@@ -235,6 +240,13 @@ def read_critic(reader: Reader, policy: FlowActorCriticPolicy) -> Perceptron | N
     if not reader.is_plain(hidden):
         return None
     return reader.perceptron((*reader.children(hidden), policy.value_net))
+
+
+def is_in_mode(module: nn.Module, mode: bool) -> bool:
+    """Whether a module and all modules within it are in training mode, or in evaluation mode."""
+    if module.training is not mode:
+        return False
+    return all(is_in_mode(child, mode) for child in module._modules.values() if child is not None)
 
 
 def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:

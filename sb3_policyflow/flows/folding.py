@@ -35,14 +35,15 @@ def fold(field: VelocityField, times: th.Tensor) -> FirstLayer:
     :param times: Times for the table, shape (n_times,).
     """
     first = field.layers[0]
+    assert isinstance(first, nn.Linear)
     dim = field.output.out_features
-    weight_of_points, weight_of_embedding = first.weight[:, :dim], first.weight[:, dim:]
+    of_points, of_embedding = first.weight[:, :dim], first.weight[:, dim:]
     observation = field.observation_embedding
     embeddings = field.time_embedding(times) + observation.bias
     return FirstLayer(
-        weight_of_points,
-        weight_of_embedding @ observation.weight,
-        nn.functional.linear(embeddings, weight_of_embedding, first.bias),
+        of_points,
+        of_embedding @ observation.weight,
+        nn.functional.linear(embeddings, of_embedding, first.bias),
     )
 
 

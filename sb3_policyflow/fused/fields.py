@@ -16,6 +16,7 @@ from sb3_policyflow.fused.networks import (
     Reader,
     Reading,
     addresses,
+    are_as_read,
     in_memory,
 )
 from sb3_policyflow.fused.perceptron import FirstLayer, Pass, split_like
@@ -40,7 +41,15 @@ class FieldParts:
         self.time = time
         self.network = network
         self.dim = network.n_outputs
+        self.features_dim = observation.weight.shape[1]
         self.tensors = [frequencies, *time.parameters, *observation, *network.parameters]
+        self.shapes = [tensor.shape for tensor in self.tensors]
+
+    def serve(self, points: th.Tensor, features: th.Tensor) -> bool:
+        """Whether points and features are those of kernels, and of this field."""
+        dims = points.shape[-1], features.shape[-1]
+        is_known = dims == (self.dim, self.features_dim) and points.numel() > 0
+        return is_known and in_memory((points, features))
 
 
 def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
@@ -52,9 +61,10 @@ def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
         time = reader.perceptron(reader.children(mlp))
         observation = reader.layer(reader.child(field, "observation_embedding"))
         network = reader.perceptron((*reader.children(hidden), reader.child(field, "output")))
-        are_known = time is not None and observation is not None and network is not None
-        if are_known and reader.are_plain(field, hidden, embedding, mlp):
-            return FieldParts(embedding.frequencies, time, observation, network)
+        is_plain = reader.are_plain(field, hidden, embedding, mlp)
+        if time and observation and network and is_plain:
+            frequencies = reader.buffer(embedding, "frequencies")
+            return FieldParts(frequencies, time, observation, network)
     note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
     return None
 
@@ -71,19 +81,20 @@ class FusedVelocityField(VelocityField):
         parts = self._reading.of(self)
         if parts is None or kernels() is None:
             return None
-        if not in_memory(parts.tensors):
+        if not are_as_read(parts.tensors, parts.shapes):
             note_fallback("parameters are not contiguous float32 on the CPU")
             return None
         return parts
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
-        if parts is None or times.requires_grad or not in_memory((points, times, features)):
+        if parts is None or not parts.serve(points, features) or not _is_data(times):
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
             features = features.expand(*leading, -1)
-        velocity: th.Tensor = _FieldEvaluation.apply(
+        apply: Any = _FieldEvaluation.apply
+        velocity: th.Tensor = apply(
             parts,
             times,
             leading,
@@ -92,6 +103,10 @@ class FusedVelocityField(VelocityField):
             *parts.tensors,
         )
         return velocity.view_as(points)
+
+
+def _is_data(times: th.Tensor) -> bool:
+    return in_memory((times,)) and not times.requires_grad
 
 
 class _Embedding:
@@ -185,7 +200,7 @@ class _FieldEvaluation(th.autograd.Function):
         return way.outputs
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
         points, features, *tensors = ctx.saved_tensors
         needs_points, needs_features = ctx.needs_input_grad[3:5]

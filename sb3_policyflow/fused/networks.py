@@ -31,6 +31,8 @@ class Perceptron:
         self.layers = layers
         self.activation = activation
         self.parameters = [tensor for layer in layers for tensor in layer]
+        self.shapes = [tensor.shape for tensor in self.parameters]
+        self.n_inputs = layers[0].weight.shape[1]
         widths = [len(layer.bias) for layer in layers]
         self.n_outputs = widths.pop()
         self.n_hidden = sum(widths)
@@ -70,7 +72,8 @@ class Reader:
             module._backward_pre_hooks,
         )
         self._hooks += hooks
-        return not any(hooks)
+        self._places.append((module.__dict__, "forward", None))
+        return not any(hooks) and "forward" not in module.__dict__
 
     def are_plain(self, *modules: nn.Module) -> bool:
         """Whether :meth:`is_plain` holds for all of them."""
@@ -85,6 +88,12 @@ class Reader:
     def children(self, module: nn.Module) -> list[Any]:
         """All modules within a module."""
         return [self.child(module, name) for name in module._modules]
+
+    def buffer(self, module: nn.Module, name: str) -> Any:
+        """A tensor of a module that is not a parameter."""
+        tensor = module._buffers[name]
+        self._places.append((module._buffers, name, tensor))
+        return tensor
 
     def layer(self, module: nn.Module) -> Layer | None:
         """The parameters of a module that is nothing but linear, or None."""
@@ -162,8 +171,20 @@ def in_memory(tensors: Iterable[th.Tensor]) -> bool:
     for tensor in tensors:
         if tensor.dtype is not th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
             return False
-    # Within torch.func's transformations, tensors stand for others.
-    return th._C._functorch.peek_interpreter_stack() is None
+    # Within torch.func's transformations tensors stand for others, and autocast wants another type.
+    is_transformed = th._C._functorch.peek_interpreter_stack() is not None
+    return not (is_transformed or th.is_autocast_enabled("cpu"))
+
+
+def are_as_read(tensors: Iterable[th.Tensor], shapes: Iterable[th.Size]) -> bool:
+    """Whether kernels can work on the tensors of a module, which have the shapes they were read in.
+
+    Setting ``parameter.data`` can change all of it and leave the parameter the same object.
+    """
+    for tensor, shape in zip(tensors, shapes, strict=True):
+        if tensor.shape != shape:
+            return False
+    return in_memory(tensors)
 
 
 def addresses(tensors: Iterable[th.Tensor]) -> NDArray[np.int64]:

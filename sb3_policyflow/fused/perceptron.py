@@ -8,8 +8,8 @@ import torch as th
 from numpy.typing import NDArray
 from torch.autograd.function import once_differentiable
 
-from sb3_policyflow.fused.compiler import kernels
-from sb3_policyflow.fused.networks import Perceptron, addresses, in_memory
+from sb3_policyflow.fused.compiler import kernels, note_fallback
+from sb3_policyflow.fused.networks import Perceptron, addresses, are_as_read, in_memory
 from sb3_policyflow.fused.threads import in_parts, n_parts
 
 Array = NDArray[Any]
@@ -17,17 +17,17 @@ NOWHERE: Array = np.zeros(0, dtype=np.int64)
 
 
 class FirstLayer(NamedTuple):
-    """A first layer of h outputs: inputs @ W^T + table[index] + shifts.
+    """A first layer of h outputs: inputs @ W^T + table[entries] + shifts.
 
     Inputs (n, n_inputs), the first of whose ``stride`` columns of weights W are used; table
-    (n_entries, h); index (n,), where an empty one stands for zeros; and shifts (m, h), of which
+    (n_entries, h); entries (n,), where an empty array stands for zeros; and shifts (m, h), of which
     each serves n / m rows; m may be 0.
     """
 
     inputs: Array
     stride: int
     table: Array
-    index: Array
+    entries: Array
     shifts: Array
 
 
@@ -67,7 +67,7 @@ class Pass:
         :return: Those of W^T, of the table, and of all parameters behind the first layer, one
             behind the other; and those of the shifts.
         """
-        network, (inputs, stride, table, index, shifts) = self._network, self._first
+        network, (inputs, stride, table, entries, shifts) = self._network, self._first
         n_grads = inputs.shape[1] * table.shape[1] + table.size
         n_grads += sum(tensor.numel() for tensor in parameters[2:])
         grads = th.zeros(self._parts, n_grads)
@@ -75,7 +75,7 @@ class Pass:
         before = (
             inputs,
             stride,
-            index,
+            entries,
             addresses(parameters),
             network.widths,
             *self._kept,
@@ -110,7 +110,7 @@ class _PerceptronEvaluation(th.autograd.Function):
         return way.outputs
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
         inputs, *parameters = ctx.saved_tensors
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
@@ -122,15 +122,17 @@ class _PerceptronEvaluation(th.autograd.Function):
 
 def split_like(flat: th.Tensor, tensors: Sequence[th.Tensor]) -> list[th.Tensor]:
     """Parts of a tensor that have the shapes of others."""
-    parts = flat.split([tensor.numel() for tensor in tensors])
+    sizes = [tensor.numel() for tensor in tensors]
+    parts: Any = flat.split(sizes)  # type: ignore[no-untyped-call]
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | None:
     """Outputs (n, n_outputs) for inputs (n, n_inputs), or None where kernels cannot work."""
-    if kernels() is None or inputs.dim() != 2:
+    if kernels() is None or inputs.dim() != 2 or inputs.shape[1] != network.n_inputs:
         return None
-    if not (in_memory(network.parameters) and in_memory((inputs,))):
+    if not (are_as_read(network.parameters, network.shapes) and in_memory((inputs,))):
+        note_fallback("features or parameters are not contiguous float32 on the CPU")
         return None
-    outputs: th.Tensor = _PerceptronEvaluation.apply(network, inputs, *network.parameters)
-    return outputs
+    apply: Any = _PerceptronEvaluation.apply
+    return apply(network, inputs, *network.parameters)  # type: ignore[no-any-return]

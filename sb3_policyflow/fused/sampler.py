@@ -12,7 +12,7 @@ from sb3_policyflow.flows.folding import fold, integrate_folded
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
 from sb3_policyflow.fused.compiler import kernels
 from sb3_policyflow.fused.fields import FieldParts, FusedVelocityField
-from sb3_policyflow.fused.networks import in_memory
+from sb3_policyflow.fused.networks import Reader
 from sb3_policyflow.fused.threads import in_parts, n_parts
 
 Array = NDArray[Any]
@@ -63,6 +63,7 @@ class FlowSampler:
         self._times = solver_times(**self._options).float()
         self._stages, self._tableau = _tableau(SOLVERS[solver], n_steps, end_time)
         self._snapshot = Snapshot()
+        self._parts: FieldParts | None = None
 
     def __reduce__(self) -> Any:
         # A copy derives what it needs from the weights that it finds.
@@ -77,9 +78,10 @@ class FlowSampler:
         :return: phi, shape (n, dim).
         """
         parts = field.parts() if type(field) is FusedVelocityField else None
-        if parts is not None and not th.is_grad_enabled() and in_memory((latents, features)):
+        is_matrix = latents.dim() == 2 and latents.shape[:-1] == features.shape[:-1]
+        if parts and is_matrix and not th.is_grad_enabled() and parts.serve(latents, features):
             return self._fused(field, parts, latents, features)
-        if type(field) in (VelocityField, FusedVelocityField):
+        if is_foldable(field):
             return integrate_folded(field, latents, features, **self._options)
         return integrate(
             lambda points, time: field(points, time, features), latents, **self._options
@@ -89,7 +91,8 @@ class FlowSampler:
         self, field: VelocityField, parts: FieldParts, latents: th.Tensor, features: th.Tensor
     ) -> th.Tensor:
         module: Any = kernels()
-        if self._snapshot.renew(parts.tensors):
+        if self._snapshot.renew(parts.tensors) or parts is not self._parts:
+            self._parts = parts
             self._network, self._method = self._derive(field, parts)
             self._work = self._stages.size * parts.network.work
         endpoints = th.empty_like(latents)
@@ -120,6 +123,14 @@ class FlowSampler:
             alpha=np.float32(activation.alpha),
         )
         return network, module.Method(first.table.numpy(), self._stages, self._tableau)
+
+
+def is_foldable(field: VelocityField) -> bool:
+    """Whether the first layer of a field is nothing but linear, as folding it supposes."""
+    reader = Reader()
+    layers = (reader.layer(field.layers[0]), reader.layer(field.observation_embedding))
+    is_known = type(field) in (VelocityField, FusedVelocityField) and reader.is_plain(field)
+    return is_known and None not in layers
 
 
 def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Array, Array]:

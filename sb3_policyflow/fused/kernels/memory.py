@@ -30,13 +30,13 @@ _bits = _pointer_to(types.int32)
 @inner
 def vector(address: int, size: int) -> Floats:
     """The numbers at an address."""
-    return carray(_floats(address), (size,))  # type: ignore[no-any-return]
+    return carray(_floats(address), (size,))
 
 
 @inner
 def matrix(address: int, n_rows: int, n_columns: int) -> Floats:
     """The matrix at an address."""
-    return carray(_floats(address), (n_rows, n_columns))  # type: ignore[no-any-return]
+    return carray(_floats(address), (n_rows, n_columns))
 
 
 @kernel
