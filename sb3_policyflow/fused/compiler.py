@@ -1,6 +1,7 @@
 """The kernels, where they can be had."""
 
 import logging
+import os
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -8,12 +9,19 @@ from types import ModuleType
 logger = logging.getLogger(__name__)
 
 
+SWITCH = "SB3_POLICYFLOW_KERNELS"
+"""Environment variable that turns the kernels off if it is 0."""
+
+
 @cache
 def kernels() -> ModuleType | None:
-    """The package of kernels, or None where numba cannot be imported.
+    """The package of kernels, or None where numba cannot be imported or kernels are turned off.
 
     Imports numba when it is first called, never with the package.
     """
+    if os.environ.get(SWITCH) == "0":
+        note_fallback(f"{SWITCH} is 0")
+        return None
     try:
         _forget_outdated()
         from sb3_policyflow.fused import kernels as module

@@ -1,12 +1,13 @@
 """Velocity fields evaluated and differentiated by kernels."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from torch.autograd.function import once_differentiable
+from torch import nn
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.fused.compiler import kernels, note_fallback
@@ -19,7 +20,13 @@ from sb3_policyflow.fused.networks import (
     are_as_read,
     in_memory,
 )
-from sb3_policyflow.fused.perceptron import FirstLayer, Pass, split_like
+from sb3_policyflow.fused.perceptron import (
+    FirstLayer,
+    Pass,
+    any_needs_grad,
+    differentiable_gradients,
+    split_like,
+)
 
 Array = NDArray[Any]
 N_EMBEDDING = 7
@@ -45,6 +52,29 @@ class FieldParts:
         self.tensors = [frequencies, *time.parameters, *observation, *network.parameters]
         self.shapes = [tensor.shape for tensor in self.tensors]
 
+    def plain(
+        self,
+        times: th.Tensor,
+        leading: th.Size,
+        points: th.Tensor,
+        features: th.Tensor,
+        tensors: Sequence[th.Tensor],
+    ) -> th.Tensor:
+        """Velocities in plain torch, for derivatives of derivatives.
+
+        :param times: Of a shape that broadcasts with the leading shape.
+        :param leading: The shape that the n points have without their dimensions.
+        :param points: shape (n, dim).
+        :param features: shape (m, features_dim), where m divides n.
+        :param tensors: In place of the field's own.
+        """
+        phases = 2 * math.pi * times.unsqueeze(-1) * tensors[0]
+        time = self.time.plain(th.cat([phases.cos(), phases.sin()], dim=-1), tensors[1:5])
+        observation = nn.functional.linear(features, *tensors[5:N_EMBEDDING])
+        embedding = time.expand(*leading, -1).reshape(len(points), -1)
+        embedding = embedding + observation.repeat_interleave(len(points) // len(features), dim=0)
+        return self.network.plain(th.cat([points, embedding], dim=-1), tensors[N_EMBEDDING:])
+
     def serve(self, points: th.Tensor, features: th.Tensor) -> bool:
         """Whether points and features are those of kernels, and of this field."""
         dims = points.shape[-1], features.shape[-1]
@@ -56,7 +86,7 @@ def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
     """The parts of a field, or None if it is not of the kind that kernels know."""
     embedding = reader.child(field, "time_embedding")
     hidden = reader.child(field, "hidden")
-    if type(embedding) is FourierTimeEmbedding and isinstance(hidden, th.nn.Sequential):
+    if type(embedding) is FourierTimeEmbedding and isinstance(hidden, nn.Sequential):
         mlp = reader.child(embedding, "mlp")
         time = reader.perceptron(reader.children(mlp))
         observation = reader.layer(reader.child(field, "observation_embedding"))
@@ -93,15 +123,13 @@ class FusedVelocityField(VelocityField):
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
             features = features.expand(*leading, -1)
-        apply: Any = _FieldEvaluation.apply
-        velocity: th.Tensor = apply(
-            parts,
-            times,
-            leading,
-            points.reshape(-1, points.shape[-1]),
-            features.reshape(-1, features.shape[-1]),
-            *parts.tensors,
-        )
+        flat = (points.reshape(-1, parts.dim), features.reshape(-1, parts.features_dim))
+        velocity: th.Tensor
+        if th.is_grad_enabled() and any_needs_grad((points, features, *parts.tensors)):
+            apply: Any = _FieldEvaluation.apply
+            velocity = apply(parts, times, leading, *flat, *parts.tensors)
+        else:
+            velocity = _run(parts, times, leading, *flat, keeps=False)[1].outputs
         return velocity.view_as(points)
 
 
@@ -175,6 +203,21 @@ class _Embedding:
         return grads
 
 
+def _run(
+    parts: FieldParts,
+    times: th.Tensor,
+    leading: th.Size,
+    points: th.Tensor,
+    features: th.Tensor,
+    keeps: bool,
+) -> tuple[_Embedding, Pass]:
+    embedding = _Embedding(parts, times.numpy(), features.detach().numpy())
+    index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
+    stride = parts.tensors[N_EMBEDDING].shape[1]
+    first = FirstLayer(points.detach().numpy(), stride, embedding.table, index, embedding.shifts)
+    return embedding, Pass(parts.network, first, keeps)
+
+
 class _FieldEvaluation(th.autograd.Function):
     """A velocity field as a node of autograd's graph."""
 
@@ -188,21 +231,20 @@ class _FieldEvaluation(th.autograd.Function):
         features: th.Tensor,
         *tensors: th.Tensor,
     ) -> th.Tensor:
-        keeps = any(ctx.needs_input_grad)
-        embedding = _Embedding(parts, times.numpy(), features.numpy())
-        index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
-        stride = tensors[N_EMBEDDING].shape[1]
-        first = FirstLayer(points.numpy(), stride, embedding.table, index, embedding.shifts)
-        way = Pass(parts.network, first, keeps)
-        if keeps:
-            ctx.embedding, ctx.way = embedding, way
-            ctx.save_for_backward(points, features, *tensors)
-        return way.outputs
+        ctx.arguments = parts, times, leading
+        ctx.embedding, ctx.way = _run(parts, times, leading, points, features, keeps=True)
+        ctx.save_for_backward(points, features, *tensors)
+        outputs: th.Tensor = ctx.way.outputs
+        return outputs
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
         points, features, *tensors = ctx.saved_tensors
+        if th.is_grad_enabled():
+            parts, times, leading = ctx.arguments
+            outputs = parts.plain(times, leading, points, features, tensors)
+            grads = differentiable_gradients(outputs, ctx.saved_tensors, grad_outputs)
+            return None, None, None, *grads
         needs_points, needs_features = ctx.needs_input_grad[3:5]
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])

@@ -1,6 +1,6 @@
 """Reading networks: which of them the kernels know, and where their parameters are."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -24,12 +24,14 @@ class Perceptron:
     """Linear layers, at least two, with one activation between them.
 
     :param layers: Their parameters.
-    :param activation: The activation.
+    :param activation: The activation, for kernels.
+    :param function: The activation, for torch.
     """
 
-    def __init__(self, layers: list[Layer], activation: Activation) -> None:
+    def __init__(self, layers: list[Layer], activation: Activation, function: nn.Module) -> None:
         self.layers = layers
         self.activation = activation
+        self.function = function
         self.parameters = [tensor for layer in layers for tensor in layer]
         self.shapes = [tensor.shape for tensor in self.parameters]
         self.n_inputs = layers[0].weight.shape[1]
@@ -38,6 +40,17 @@ class Perceptron:
         self.n_hidden = sum(widths)
         self.widths: NDArray[np.int64] = np.array(widths)
         self.work = sum(layer.weight.numel() for layer in layers)
+
+    def plain(self, inputs: th.Tensor, parameters: Sequence[th.Tensor]) -> th.Tensor:
+        """The outputs in plain torch, for derivatives of derivatives.
+
+        :param inputs: shape (..., n_inputs).
+        :param parameters: Weight and bias of each layer.
+        """
+        *hidden, (weight, bias) = zip(parameters[::2], parameters[1::2], strict=True)
+        for hidden_weight, hidden_bias in hidden:
+            inputs = self.function(nn.functional.linear(inputs, hidden_weight, hidden_bias))
+        return nn.functional.linear(inputs, weight, bias)
 
 
 class Reader:
@@ -137,7 +150,7 @@ class Reader:
         if len(activations) != 1 or len(modules) % 2 == 0 or len(known) < len(layers):
             return None
         activation = activations.pop()
-        return None if activation is None else Perceptron(known, activation)
+        return None if activation is None else Perceptron(known, activation, modules[1])
 
 
 class Reading(Generic[T]):
@@ -160,7 +173,7 @@ class Reading(Generic[T]):
 
     def of(self, module: Any) -> T | None:
         """What there is to be read from the module."""
-        if module is not self._module or not self._reader.holds():
+        if self._found is None or module is not self._module or not self._reader.holds():
             self._module, self._reader = module, Reader()
             self._found = self._read(self._reader, module)
         return self._found

@@ -1,12 +1,11 @@
 """Networks evaluated and differentiated by kernels."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from torch.autograd.function import once_differentiable
 
 from sb3_policyflow.fused.compiler import kernels, note_fallback
 from sb3_policyflow.fused.networks import Perceptron, addresses, are_as_read, in_memory
@@ -54,7 +53,21 @@ class Pass:
             *self._kept,
         )
         run = kernels().forward  # type: ignore[union-attr]
-        in_parts(n_rows, self._parts, lambda _, start, stop: run(*arguments, start, stop))
+        self._in_parts(lambda _, start, stop: run(*arguments, start, stop))
+
+    def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
+        """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both ways.
+
+        What is kept depends on where blocks of rows begin, and rows that share a shift belong
+        together.
+        """
+        n_rows, n_shifts = len(self._first.inputs), len(self._first.shifts)
+        group = n_rows // n_shifts if n_shifts else 1
+        in_parts(
+            n_rows // group,
+            self._parts,
+            lambda part, start, stop: run(part, start * group, stop * group),
+        )
 
     def back(
         self, parameters: Sequence[th.Tensor], grad_outputs: th.Tensor, grad_inputs: Array
@@ -83,12 +96,7 @@ class Pass:
         )
         after = (len(table), grad_shifts, grad_inputs)
         flat, run = grads.numpy(), kernels().backward  # type: ignore[union-attr]
-        group = len(inputs) // len(shifts) if len(shifts) else 1
-        in_parts(
-            len(inputs) // group,
-            self._parts,
-            lambda part, start, stop: run(*before, flat[part], *after, start * group, stop * group),
-        )
+        self._in_parts(lambda part, start, stop: run(*before, flat[part], *after, start, stop))
         return grads[0] if self._parts == 1 else grads.sum(0), grad_shifts
 
 
@@ -99,25 +107,38 @@ class _PerceptronEvaluation(th.autograd.Function):
     def forward(
         ctx: Any, network: Perceptron, inputs: th.Tensor, *parameters: th.Tensor
     ) -> th.Tensor:
-        keeps = any(ctx.needs_input_grad)
-        table = parameters[1].numpy()[None]
-        no_shifts = np.zeros((0, table.shape[1]), dtype=np.float32)
-        first = FirstLayer(inputs.numpy(), inputs.shape[1], table, NOWHERE, no_shifts)
-        way = Pass(network, first, keeps)
-        if keeps:
-            ctx.way = way
-            ctx.save_for_backward(inputs, *parameters)
-        return way.outputs
+        ctx.network, ctx.way = network, _run(network, inputs, keeps=True)
+        ctx.save_for_backward(inputs, *parameters)
+        outputs: th.Tensor = ctx.way.outputs
+        return outputs
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
         inputs, *parameters = ctx.saved_tensors
+        if th.is_grad_enabled():
+            outputs = ctx.network.plain(inputs, parameters)
+            return None, *differentiable_gradients(outputs, ctx.saved_tensors, grad_outputs)
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
         flat, _ = ctx.way.back(parameters, grad_outputs, grad_inputs.numpy())
         weight, *others = split_like(flat, parameters)
         weight = weight.view(inputs.shape[1], -1).T.contiguous()
         return None, grad_inputs if len(grad_inputs) else None, weight, *others
+
+
+def _run(network: Perceptron, inputs: th.Tensor, keeps: bool) -> Pass:
+    table = network.parameters[1].detach().numpy()[None]
+    no_shifts = np.zeros((0, table.shape[1]), dtype=np.float32)
+    first = FirstLayer(inputs.detach().numpy(), inputs.shape[1], table, NOWHERE, no_shifts)
+    return Pass(network, first, keeps)
+
+
+def differentiable_gradients(
+    outputs: th.Tensor, inputs: Sequence[th.Tensor], grad_outputs: th.Tensor
+) -> list[th.Tensor | None]:
+    """Gradients that have gradients themselves; None for inputs that need none."""
+    needed = [tensor for tensor in inputs if tensor.requires_grad]
+    found = iter(th.autograd.grad(outputs, needed, grad_outputs, create_graph=True))
+    return [next(found) if tensor.requires_grad else None for tensor in inputs]
 
 
 def split_like(flat: th.Tensor, tensors: Sequence[th.Tensor]) -> list[th.Tensor]:
@@ -127,6 +148,11 @@ def split_like(flat: th.Tensor, tensors: Sequence[th.Tensor]) -> list[th.Tensor]
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
+def any_needs_grad(tensors: Iterable[th.Tensor]) -> bool:
+    """Whether a gradient with respect to any of the tensors may be asked for."""
+    return any(tensor.requires_grad for tensor in tensors)
+
+
 def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | None:
     """Outputs (n, n_outputs) for inputs (n, n_inputs), or None where kernels cannot work."""
     if kernels() is None or inputs.dim() != 2 or inputs.shape[1] != network.n_inputs:
@@ -134,5 +160,7 @@ def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | N
     if not (are_as_read(network.parameters, network.shapes) and in_memory((inputs,))):
         note_fallback("features or parameters are not contiguous float32 on the CPU")
         return None
+    if not (th.is_grad_enabled() and any_needs_grad((inputs, *network.parameters))):
+        return _run(network, inputs, keeps=False).outputs
     apply: Any = _PerceptronEvaluation.apply
     return apply(network, inputs, *network.parameters)  # type: ignore[no-any-return]

@@ -1,0 +1,187 @@
+"""Time PolicyFlow and SB3's PPO, in turn and in one process.
+
+Same environments, networks, batches and epochs. Ratios are PolicyFlow's time over PPO's. For
+figures to report, let nothing else run on the machine.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_policyflow.benchmark.costs import versions
+from sb3_policyflow.benchmark.speed_settings import GROWTH, MAIN, halfcheetah, isaaclab
+from sb3_policyflow.benchmark.table import markdown_table
+from sb3_policyflow.benchmark.timing import PARTS, peak_memory, time_calls, time_setting
+
+EMBEDDINGS = (64, 256, 512)
+CHOICES = (*MAIN, "predict", "memory", "growth", "isaaclab")
+
+
+def predict_times(repetitions: int) -> dict[str, Any]:
+    """Prediction of one action for HalfCheetah-v5, as a robot or ``enjoy`` asks for it."""
+    setting = halfcheetah()
+    models = {name: make() for name, make in setting.makers.items()}
+    observation = models["PPO"].env.reset()[0]  # type: ignore[union-attr, index]
+    calls = {
+        name: partial(model.predict, observation, deterministic=True)
+        for name, model in models.items()
+    }
+    seconds = time_calls(calls, repetitions)
+    return {"seconds": seconds, "ratio": seconds["PolicyFlow"] / seconds["PPO"]}
+
+
+def memory_of(name: str, maker: str) -> float:
+    """Peak memory in MiB of two iterations, in a process of their own."""
+    command = [sys.executable, "-m", __spec__.name, "--memory-of", name, maker]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return float(output.split()[-1])
+
+
+def measure_memory(name: str, maker: str) -> float:
+    """Train for two iterations, and say how much memory this process has needed."""
+    model = MAIN[name]().makers[maker]()
+    model.learn(2 * model.n_steps * model.n_envs)
+    return peak_memory()
+
+
+def memory_figures() -> dict[str, dict[str, float]]:
+    """Peak memory of each algorithm in each setting."""
+    names = ("multigoal", "halfcheetah", "pendulum")
+    return {name: {who: memory_of(name, who) for who in ("PolicyFlow", "PPO")} for name in names}
+
+
+def growth_figures(repetitions: int) -> dict[str, list[dict[str, Any]]]:
+    """Iterations while one thing grows."""
+    return {
+        what: [{"value": n, **time_setting(make(n), repetitions)} for n in values]
+        for what, (make, values) in GROWTH.items()
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "torch_threads": th.get_num_threads(),
+        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
+        "system": platform.platform(),
+        **versions(),
+    }
+
+
+def _processor() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+# Tables
+
+
+def iterations_table(results: Sequence[dict[str, Any]]) -> str:
+    """A row for each model: its median time, what it goes to, and the ratio."""
+    rows = []
+    for result in results:
+        for place, (name, seconds) in enumerate(result["seconds"].items()):
+            ratio = f"**{result['ratio']:.2f}**" if place == 0 else ""
+            times = [f"{1000 * seconds[part]:.0f}" for part in ("total", *PARTS)]
+            rows.append([result["title"], name, ratio, *times])
+    return markdown_table(["", "", "ratio", "iteration, ms", *PARTS], rows)
+
+
+def growth_table(what: str, results: Sequence[dict[str, Any]]) -> str:
+    """A row for each value of what grows."""
+    rows = [
+        [
+            str(result["value"]),
+            *(f"{1000 * seconds['total']:.0f}" for seconds in result["seconds"].values()),
+            f"{result['ratio']:.2f}",
+        ]
+        for result in results
+    ]
+    return markdown_table([what, "PolicyFlow, ms", "PPO, ms", "ratio"], rows)
+
+
+def calls_table(result: dict[str, Any]) -> str:
+    """One row for ``predict``."""
+    times = [f"{1e6 * result['seconds'][name]:.0f}" for name in ("PolicyFlow", "PPO")]
+    header = ["predict, one observation", "PolicyFlow, us", "PPO, us", "ratio"]
+    return markdown_table(header, [["HalfCheetah-v5", *times, f"**{result['ratio']:.2f}**"]])
+
+
+def memory_table(results: dict[str, dict[str, float]]) -> str:
+    """A row for each setting."""
+    rows = []
+    for name, mib in results.items():
+        ratio = mib["PolicyFlow"] / mib["PPO"]
+        rows.append([name, f"{mib['PolicyFlow']:.0f}", f"{mib['PPO']:.0f}", f"{ratio:.2f}"])
+    return markdown_table(["peak memory", "PolicyFlow, MiB", "PPO, MiB", "ratio"], rows)
+
+
+def measure(what: str, repetitions: int, device: str) -> tuple[Any, str]:
+    """Figures and their table.
+
+    :param what: One of ``CHOICES``.
+    :param repetitions: How often to measure.
+    :param device: Where "isaaclab" trains.
+    """
+    if what == "predict":
+        calls = predict_times(repetitions)
+        return calls, calls_table(calls)
+    if what == "memory":
+        memory = memory_figures()
+        return memory, memory_table(memory)
+    if what == "growth":
+        growth = growth_figures(repetitions)
+        return growth, "\n\n".join(growth_table(*item) for item in growth.items())
+    if what == "isaaclab":
+        sizes = [time_setting(isaaclab(size, device), repetitions) for size in EMBEDDINGS]
+        return sizes, iterations_table(sizes)
+    result = time_setting(MAIN[what](), repetitions)
+    return result, iterations_table([result])
+
+
+def main(argv: list[str]) -> int:
+    """Measure, write tables to the terminal and figures to a file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_policyflow.benchmark speed", description=__doc__
+    )
+    default = [*MAIN, "predict", "memory"]
+    parser.add_argument("what", nargs="*", help=f"of {', '.join(CHOICES)}; default: {default}")
+    parser.add_argument("--repetitions", type=int, default=5, help="default: 5")
+    parser.add_argument("--threads", type=int, help="torch's threads; default: torch's own")
+    parser.add_argument("--device", default="auto", help='of "isaaclab"; default: a GPU if any')
+    parser.add_argument("--out", type=Path, help="a JSON file for all figures")
+    parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
+    arguments = parser.parse_args(argv)
+    unknown = set(arguments.what) - set(CHOICES)
+    if unknown:
+        parser.error(f"cannot measure {sorted(unknown)}: choose of {', '.join(CHOICES)}")
+    if arguments.threads is not None:
+        th.set_num_threads(arguments.threads)
+    if arguments.memory_of:
+        sys.stdout.write(f"{measure_memory(*arguments.memory_of)}\n")
+        return 0
+    figures: dict[str, Any] = {"machine": machine()}
+    for what in arguments.what or default:
+        figures[what], table = measure(what, arguments.repetitions, arguments.device)
+        sys.stdout.write(f"{table}\n\n")
+        sys.stdout.flush()
+    if arguments.out is not None:
+        arguments.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
