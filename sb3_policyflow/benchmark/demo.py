@@ -8,15 +8,41 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_policyflow.benchmark.experiment import make_experiment
-from sb3_policyflow.benchmark.goals import goal_report, sample_trajectories
+from sb3_policyflow.benchmark.goals import evaluate_goals, goal_report, sample_trajectories
 from sb3_policyflow.benchmark.plots import goals_figure, learning_curve_figure
 
 ENV = "MultiGoal-v0"
 N_TRAJECTORIES = 1000
+EVALUATE_EVERY = 500_000
+
+
+class GoalsCallback(BaseCallback):
+    """Logs, from time to time, which goals are reached from the centre.
+
+    :param every: Environment steps between evaluations.
+    """
+
+    def __init__(self, every: int) -> None:
+        super().__init__()
+        self._every = every
+        self._due = every
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps < self._due:
+            return
+        self._due += self._every
+        report = evaluate_goals(self.model, N_TRAJECTORIES)
+        self.logger.record("goals/reached", report.n_goals)
+        self.logger.record("goals/entropy", report.entropy)
+        self.logger.record("goals/mean_return", report.mean_return)
 
 
 def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
@@ -32,7 +58,7 @@ def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
     model = setup[0]
     assert isinstance(model, OnPolicyAlgorithm)
     model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(experiment.n_timesteps, progress_bar=True)
+    model.learn(experiment.n_timesteps, GoalsCallback(EVALUATE_EVERY), progress_bar=True)
     model.save(folder / "model")
     return model
 

@@ -60,6 +60,8 @@ def _run_cell(cell: Cell, folder: Path, n_threads: int) -> bool:
         outcome = subprocess.run(
             command, stdout=file, stderr=subprocess.STDOUT, env=os.environ | threads, check=False
         )
+        # A process that was killed says nothing itself; its code is minus the signal.
+        file.write(f"exit code {outcome.returncode}\n")
     if outcome.returncode == 0:
         log.unlink()
     return outcome.returncode == 0

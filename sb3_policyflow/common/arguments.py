@@ -140,6 +140,10 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         checks.check_environment(type(self).__name__, self.env, space)
         check_flow_spaces(self.action_space, self.use_sde)
         checks.check_policy_class(type(self).__name__, self.policy_class, self.policy_base)
+        for name in ("learning_rate", "clip_range", "vf_coef"):
+            checks.check_between(name, getattr(self, name), 0.0)
+        for name in ("gamma", "gae_lambda"):
+            checks.check_between(name, getattr(self, name), 0.0, 1.0)
         checks.check_at_least("n_steps", self.n_steps, 1)
         checks.check_at_least("n_epochs", self.n_epochs, 1)
         checks.check_batches(self.batch_size, self.n_steps, self.n_envs, self.normalize_advantage)

@@ -1,7 +1,9 @@
 """Checks of what the user asks for, made before any work is done."""
 
+import math
 import warnings
 from collections.abc import Collection
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,17 @@ def check_at_least(name: str, value: float, lowest: float) -> None:
     """
     if not isinstance(value, (int, float)) or not value >= lowest:
         raise ValueError(f"{name} must be at least {lowest}, got {value!r}.")
+
+
+def check_between(name: str, value: object, lowest: float, highest: float = math.inf) -> None:
+    """Refuse a number that is out of range; schedules, which are functions, pass.
+
+    :raises ValueError: With the range.
+    """
+    if callable(value):
+        return
+    if not isinstance(value, Real) or not lowest <= float(value) <= highest:
+        raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
 
 
 def check_positive_or_none(name: str, value: float | None) -> None:

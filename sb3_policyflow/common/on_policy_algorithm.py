@@ -160,7 +160,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         loss.backward()  # type: ignore[no-untyped-call]
         clips = self.max_grad_norm is not None and self.max_grad_norm > 0
         norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
-        if not math.isfinite(norm):
+        if not (math.isfinite(norm) and th.isfinite(loss)):
             what = "gradient" if th.isfinite(loss) else "loss"
             raise FloatingPointError(
                 f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "

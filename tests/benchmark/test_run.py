@@ -83,7 +83,9 @@ def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
     )
     assert outcome.returncode == 1
     assert "failed: fpo NoSuch-v0 seed 0" in outcome.stderr
-    assert "NoSuch" in (tmp_path / "fpo/NoSuch-v0/seed-0.log").read_text()
+    log = (tmp_path / "fpo/NoSuch-v0/seed-0.log").read_text()
+    assert "NoSuch" in log
+    assert log.endswith("exit code 1\n")
 
 
 def test_table_and_plot(folder: Path, tmp_path: Path) -> None:

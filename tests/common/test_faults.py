@@ -219,9 +219,7 @@ def test_actions() -> None:
     model = trained(DummyVecEnv(make("none")))
     with th.no_grad():
         model.policy.velocity.output.bias.fill_(th.inf)
-    with pytest.raises(
-        FloatingPointError, match=r"One of the rollout's actions is not finite at timestep 2"
-    ):
+    with pytest.raises(FloatingPointError, match=r"actions? is not finite at timestep 2"):
         model.learn(16)
 
 

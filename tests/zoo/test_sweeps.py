@@ -101,7 +101,11 @@ def test_workers_share_a_study_and_one_is_killed(
     study = create_study(storage, ENDLESS, CHEAP, CHEAP)
     victim = installed.start(sweep(storage, 9), tmp_path)
     wait_for_a_running_trial(study, victim)
-    workers = [installed.start(sweep(storage, 1), tmp_path) for _ in range(2)]
+    # Each in a folder of its own, as on two machines: reports are named by the second.
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.mkdir()
+    workers = [installed.start(sweep(storage, 1), folder) for folder in folders]
     victim.send_signal(signal.SIGKILL)
     outputs = [worker.communicate()[0] for worker in workers]
 
