@@ -19,7 +19,7 @@ from torch import nn
 
 from sb3_policyflow.common.optimisation import make_optimizer
 from sb3_policyflow.fused.fields import FusedVelocityField
-from sb3_policyflow.fused.networks import Perceptron, Reader, Reading
+from sb3_policyflow.fused.networks import Perceptron, Reader, Reading, is_eager
 from sb3_policyflow.fused.perceptron import evaluate_perceptron
 
 NetArch = list[int] | dict[str, list[int]]
@@ -174,7 +174,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
-        network = self._critic.of(self)
+        network = self._critic.of(self) if is_eager() else None
         values = None if network is None else evaluate_perceptron(network, features)
         if values is None:
             values = self.value_net(self.mlp_extractor.forward_critic(features))

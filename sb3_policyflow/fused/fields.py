@@ -19,6 +19,7 @@ from sb3_policyflow.fused.networks import (
     addresses,
     are_as_read,
     in_memory,
+    is_eager,
 )
 from sb3_policyflow.fused.perceptron import (
     FirstLayer,
@@ -108,8 +109,10 @@ class FusedVelocityField(VelocityField):
 
     def parts(self) -> FieldParts | None:
         """What the field consists of, or None if kernels cannot work on it."""
+        if not is_eager() or kernels() is None:
+            return None
         parts = self._reading.of(self)
-        if parts is None or kernels() is None:
+        if parts is None:
             return None
         if not are_as_read(parts.tensors, parts.shapes):
             note_fallback("parameters are not contiguous float32 on the CPU")

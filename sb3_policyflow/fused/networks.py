@@ -179,6 +179,11 @@ class Reading(Generic[T]):
         return self._found
 
 
+def is_eager() -> bool:
+    """Whether tensors have values, which they have not for those who compile, export or trace."""
+    return not th.compiler.is_compiling() and th._C._get_tracing_state() is None
+
+
 def in_memory(tensors: Iterable[th.Tensor]) -> bool:
     """Whether kernels can work on these tensors: contiguous float32 on the CPU."""
     for tensor in tensors:

@@ -85,6 +85,18 @@ def test_autocast_keeps_its_type() -> None:
         assert field(x, t, s).dtype == plain_copy(field)(x, t, s).dtype == th.bfloat16
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_traced_and_exported_fields_contain_their_weights() -> None:
+    field = make_field(2, 3, [8, 8])
+    inputs = th.randn(6, 2), th.rand(6), th.randn(6, 3)
+    others = th.randn(6, 2), th.rand(6), th.randn(6, 3)
+    traced = th.jit.trace(field, inputs)
+    exported = th.export.export(field, inputs).module()
+    with th.no_grad():
+        th.testing.assert_close(traced(*others), field(*others))
+        th.testing.assert_close(exported(*others), field(*others))
+
+
 def test_a_subclass_has_its_own_velocity() -> None:
     class Still(FusedVelocityField):
         def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:

@@ -129,7 +129,9 @@ def _combine(points: Floats, slopes: Any, weights: Floats, outputs: Floats) -> N
         for i in range(points.shape[1]):
             x = points[row, i]
             for j in range(slopes.shape[0]):
-                x += weights[j] * slopes[j, row, i]
+                # Zero times infinity is not a number.
+                if weights[j] != F(0.0):
+                    x += weights[j] * slopes[j, row, i]
             outputs[row, i] = x
 
 

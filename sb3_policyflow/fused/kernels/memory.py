@@ -23,6 +23,8 @@ def _pointer_to(number: Any) -> Any:
     return intrinsic(pointer)
 
 
+GREATEST = float(np.finfo(np.float32).max)
+
 _floats = _pointer_to(types.float32)
 _bits = _pointer_to(types.int32)
 
@@ -64,7 +66,7 @@ def clip(addresses: Integers, sizes: Integers, max_norm: float) -> float:
     :param addresses: Where arrays start.
     :param sizes: How many numbers each has.
     :param max_norm: The norm; infinity to leave them alone.
-    :return: The norm that they had.
+    :return: The norm that they had; as torch's, infinite if its square is so in float32.
     """
     total = 0.0
     for place in range(addresses.size):
@@ -73,7 +75,7 @@ def clip(addresses: Integers, sizes: Integers, max_norm: float) -> float:
         for i in range(numbers.size):
             squares += np.float64(numbers[i]) * np.float64(numbers[i])
         total += squares
-    norm = math.sqrt(total)
+    norm = math.sqrt(total) if total <= GREATEST else np.inf
     factor = F(max_norm / (norm + 1e-6))
     if factor < F(1.0) and norm < np.inf:
         for place in range(addresses.size):
