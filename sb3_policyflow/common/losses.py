@@ -5,6 +5,9 @@ from collections.abc import Callable
 
 import torch as th
 
+SMALLEST_CLIP_RANGE = 1e-6
+"""Epsilon of the penalties that divide by it, at least."""
+
 
 def shifted_gaussian_log_ratio(
     noise: th.Tensor, shift: th.Tensor, log_std: th.Tensor, old_log_std: th.Tensor
@@ -94,7 +97,9 @@ def penalised_surrogate(
     Takes and returns the shapes of :func:`clipped_surrogate`.
     """
     ratio = log_ratio.exp()
-    return ratio * advantages - advantages.abs() / (2 * clip_range) * (ratio - 1) ** 2
+    # A schedule may end at 0, where the old policy alone is allowed.
+    width = th.as_tensor(clip_range).clamp_min(SMALLEST_CLIP_RANGE)
+    return ratio * advantages - advantages.abs() / (2 * width) * (ratio - 1) ** 2
 
 
 def asymmetric_surrogate(

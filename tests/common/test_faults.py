@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.envs.vector import GymVectorVecEnv
+from sb3_policyflow.fpo import FPO
 
 FAULT_STEP = 5
 SMALL: dict[str, Any] = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "seed": 0}
@@ -85,7 +86,7 @@ def within(seconds: int) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def weights(model: PolicyFlow) -> th.Tensor:
+def weights(model: PolicyFlow | FPO) -> th.Tensor:
     return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
 
 
@@ -262,3 +263,12 @@ def test_log_ratios_can_be_clamped() -> None:
     model = update(20.0)
     assert th.isfinite(weights(model)).all()
     assert model.logger.name_to_value["train/log_ratio_max"] > 88  # what it was before
+
+
+@pytest.mark.parametrize("trust_region", ["ppo", "spo", "aspo"])
+def test_trust_regions_may_shrink_to_nothing(trust_region: str) -> None:
+    """At the end of a linear schedule the clip range is 0."""
+    env = DummyVecEnv(make("none"))
+    options = {**SMALL, "n_epochs": 3, "trust_region": trust_region}
+    model = FPO("MlpPolicy", env, clip_range=lambda progress: 0.2 * progress, **options)
+    assert th.isfinite(weights(model.learn(32))).all()
