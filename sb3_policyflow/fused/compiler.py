@@ -2,6 +2,7 @@
 
 import logging
 import os
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -45,5 +46,7 @@ def _forget_outdated() -> None:
     folder = Path(__file__).parent / "kernels"
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
     for compiled in folder.glob("__pycache__/*.nb[ci]"):
-        if compiled.stat().st_mtime < newest:
-            compiled.unlink(missing_ok=True)
+        # Another process may delete it first.
+        with suppress(OSError):
+            if compiled.stat().st_mtime < newest:
+                compiled.unlink()
