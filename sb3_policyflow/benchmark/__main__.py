@@ -12,6 +12,7 @@ SUBCOMMANDS = {
     "table": "sum up what was run",
     "plot": "draw learning curves and probabilities of improvement",
     "multigoal": "the paper's MultiGoal figure",
+    "pointmaze": "the paper's exploration maps",
     "speed": "time PolicyFlow and PPO side by side",
     "cell": "one training, as `run` starts it",
 }

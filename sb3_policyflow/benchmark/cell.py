@@ -6,7 +6,7 @@ import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
@@ -18,6 +18,9 @@ from sb3_policyflow.benchmark.evaluation import EvaluationCallback
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.goals import goal_report, sample_trajectories
 from sb3_policyflow.benchmark.results import Cell, Result
+
+if TYPE_CHECKING:
+    from sb3_policyflow.benchmark.visits import VisitCounter
 
 N_EVALUATION_ENVS = 10
 
@@ -38,10 +41,14 @@ def train_cell(cell: Cell, folder: Path) -> Result:
         assert isinstance(model, OnPolicyAlgorithm)
         env = manager.create_envs(min(N_EVALUATION_ENVS, cell.n_episodes), eval_env=True)
         evaluations = EvaluationCallback(env, _due(cell), cell.n_episodes)
+        counters = _visit_counters(cell)
+        callbacks = [*manager.callbacks, *counters]
         summary = {
             "hyperparams": {key: str(value) for key, value in hyperparams.items()},
-            **_train(model, cell.steps, evaluations, manager.callbacks),
+            **_train(model, cell.steps, evaluations, callbacks),
         }
+        for counter in counters:
+            counter.visits().save(_archive(cell, folder))
         if cell.n_trajectories:
             summary["goals"] = _keep_trajectories(model, cell, folder)
         env.close()
@@ -84,14 +91,28 @@ def _train(
     }
 
 
+def _visit_counters(cell: Cell) -> list["VisitCounter"]:
+    """What counts visits, if they are to be kept; only this needs the extra ``robotics``."""
+    if not cell.keep_visits:
+        return []
+    from sb3_policyflow.benchmark.visits import VisitCounter
+
+    return [VisitCounter()]
+
+
+def _archive(cell: Cell, folder: Path) -> Path:
+    """Where arrays of a cell go; the folder is made."""
+    path = cell.path(folder, ".npz")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def _keep_trajectories(model: OnPolicyAlgorithm, cell: Cell, folder: Path) -> dict[str, Any]:
     """Run episodes from the centre of MultiGoal, keep them, and say which goals they reached."""
     trajectories = sample_trajectories(model, cell.n_trajectories)
     report = goal_report(trajectories)
-    path = cell.path(folder, ".npz")
-    path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path,
+        _archive(cell, folder),
         positions=trajectories.positions.astype(np.float16),
         lengths=trajectories.lengths.astype(np.int16),
         returns=trajectories.returns.astype(np.float32),

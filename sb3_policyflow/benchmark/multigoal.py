@@ -4,20 +4,20 @@ Trains what is missing, with every seed; draws the first seed's trajectories to 
 and writes the table of all seeds to ``multigoal.md``.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_policyflow.benchmark.goals import Trajectories
+from sb3_policyflow.benchmark.panels import Panel, over_seeds, panel_cells, panel_parser
 from sb3_policyflow.benchmark.plots import goals_figure
 from sb3_policyflow.benchmark.results import Cell, Result, distinct, load_results
-from sb3_policyflow.benchmark.run import add_running_arguments, report_failures, run_cells
+from sb3_policyflow.benchmark.run import report_failures, run_cells
 from sb3_policyflow.benchmark.table import markdown_table
 
 ENV = "MultiGoal-v0"
+N_TRAJECTORIES = 1000
 HEADER = (
     "panel",
     "seeds",
@@ -29,14 +29,6 @@ HEADER = (
     "gradient steps",
     "minutes",
 )
-
-
-class Panel(NamedTuple):
-    """One panel: its title, rl_zoo3's name of the algorithm, and what differs from its YAML."""
-
-    title: str
-    algo: str
-    hyperparams: dict[str, Any]
 
 
 PANELS = {
@@ -58,27 +50,6 @@ PANELS = {
 """The paper's panels (a) to (f)."""
 
 
-def panel_cells(
-    seeds: Sequence[int], steps: int, n_evaluations: int, n_episodes: int
-) -> list[Cell]:
-    """The trainings that the figure needs."""
-    return [
-        Cell(
-            name,
-            panel.algo,
-            ENV,
-            seed,
-            steps,
-            panel.hyperparams,
-            n_evaluations=n_evaluations,
-            n_episodes=n_episodes,
-            n_trajectories=1000,
-        )
-        for seed in seeds
-        for name, panel in PANELS.items()
-    ]
-
-
 def load_trajectories(cell: Cell, folder: Path) -> Trajectories:
     """The episodes from the centre that a cell kept."""
     with np.load(cell.path(folder, ".npz")) as kept:
@@ -96,10 +67,6 @@ def goals_table(results: Sequence[Result]) -> str:
 
 
 def _row(name: str, runs: Sequence[Result]) -> list[str]:
-    def over_seeds(values: Sequence[float], digits: int = 2) -> str:
-        mean = f"{np.mean(values):.{digits}f}"
-        return mean if len(values) == 1 else f"{mean} ({min(values):.3g} to {max(values):.3g})"
-
     goals = [run.summary["goals"] for run in runs]
     missed = [g["n_missed"] / (g["n_missed"] + sum(g["counts"])) for g in goals]
     return [
@@ -129,16 +96,8 @@ def draw(folder: Path, results: Sequence[Result]) -> None:
 
 def main(argv: list[str]) -> int:
     """Train what is missing and make the figure."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark multigoal", description=__doc__
-    )
-    parser.add_argument("--steps", type=float, default=7.4e6, help="environment steps of each")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/multigoal"))
-    add_running_arguments(parser)
-    arguments = parser.parse_args(argv)
-    cells = panel_cells(
-        arguments.seeds, int(arguments.steps), arguments.evaluations, arguments.episodes
-    )
+    arguments = panel_parser("multigoal", __doc__, PANELS, steps=7.4e6).parse_args(argv)
+    cells = panel_cells(PANELS, arguments, env=ENV, n_trajectories=N_TRAJECTORIES)
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
     draw(arguments.out, load_results(arguments.out))
     return report_failures(failed)

@@ -1,171 +1,66 @@
-"""Where in the maze a training goes: visit counts, two numbers and the density map.
+"""The paper's exploration maps: where in the maze three trainings go, on one colour scale.
 
-The paper shows maps of all training episodes; here they come with the share of the free space that
-was visited, and the entropy of the visits relative to a uniform density. Both are over square cells
-of side ``CELL_SIZE``, of which each free cell of the maze has 16; the ball's centre can reach all.
+Trains what is missing, with every seed; draws the mean maps to ``pointmaze.png`` and writes their
+numbers to ``pointmaze.md``.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from sb3_policyflow.benchmark.panels import Panel, over_seeds, panel_cells, panel_parser
+from sb3_policyflow.benchmark.results import Result, load_results
+from sb3_policyflow.benchmark.run import report_failures, run_cells
+from sb3_policyflow.benchmark.table import markdown_table
+from sb3_policyflow.benchmark.visits import VisitMap, density_figure
+from sb3_policyflow.envs.point_maze import ENV_ID
 
-from sb3_policyflow.benchmark.goals import normalised_entropy
-from sb3_policyflow.benchmark.plots import DPI
-from sb3_policyflow.envs.drawing import GOAL_COLOURS, INK, MARGIN
-from sb3_policyflow.envs.point_maze import GOAL_CELLS, START_CELL, cell_centre, medium_maze
+HEADER = ("panel", "seeds", "free cells visited", "entropy of visits", "evaluation return")
 
-FloatArray = NDArray[np.float64]
-
-CELLS_PER_SIDE = 4
-CELL_SIZE = 1.0 / CELLS_PER_SIDE
-SCALE_LIMITS = (0.01, 100.0)
-SCALE = LogNorm(*SCALE_LIMITS)
-COLOURS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="white")
+PANELS = {
+    "b-ppo": Panel("(b) PPO", "ppo", {}),
+    "c-plain": Panel("(c) PolicyFlow", "policyflow", {"brownian_coef": 0.0}),
+    "d-brownian": Panel("(d) PolicyFlow, Brownian", "policyflow", {}),
+}
+"""The paper's panels (b) to (d); its (a) is the maze itself."""
 
 
-@dataclass(frozen=True)
-class VisitMap:
-    """Environment steps that ended in each cell.
+def visits_table(seeds: dict[str, list[Result]], maps: dict[str, list[VisitMap]]) -> str:
+    """A row for each panel: means over seeds, and the range where there are several.
 
-    :param counts: visits, rows from the top, shape ``(n_rows, n_columns)``
-    :param free: whether each cell is free of walls, of the same shape
+    :param seeds: Results by panel.
+    :param maps: Their visit maps, in the same order.
     """
-
-    counts: NDArray[np.int64]
-    free: NDArray[np.bool_]
-
-    @property
-    def coverage(self) -> float:
-        """Share of the free cells that were visited at least once."""
-        return float((self.counts[self.free] > 0).mean())
-
-    @property
-    def entropy(self) -> float:
-        """Entropy of the visits over the free cells, relative to that of a uniform density."""
-        return normalised_entropy(self.counts[self.free])
-
-    @property
-    def density(self) -> FloatArray:
-        """Visits relative to a uniform density (1 everywhere), NaN in walls."""
-        n_visits = max(1, self.counts[self.free].sum())
-        return np.where(self.free, self.counts * self.free.sum() / n_visits, np.nan)
-
-    def save(self, path: str | Path) -> None:
-        """Write to an ``npz`` file."""
-        np.savez_compressed(path, counts=self.counts, free=self.free)
-
-    @classmethod
-    def load(cls, path: str | Path) -> VisitMap:
-        """Read what ``save`` wrote."""
-        with np.load(path) as file:
-            return cls(file["counts"], file["free"])
+    rows = [
+        [
+            PANELS[name].title,
+            str(len(runs)),
+            over_seeds([100 * each.coverage for each in maps[name]], digits=1) + " %",
+            over_seeds([each.entropy for each in maps[name]]),
+            over_seeds([run.summary["final"]["stochastic"]["mean_return"] for run in runs], 1),
+        ]
+        for name, runs in seeds.items()
+    ]
+    return markdown_table(HEADER, rows)
 
 
-class VisitCounter(BaseCallback):
-    """Counts, at each environment step of a training, the cells that the balls are in.
-
-    Episodes' last positions count, their given starts do not: the total is the number of steps.
-    Observations may be those of ``PointMazeMultiGoal-Medium-v0`` or of the stock medium mazes,
-    under ``VecNormalize`` or not.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.free = np.kron(medium_maze(), np.ones((CELLS_PER_SIDE, CELLS_PER_SIDE), dtype=bool))
-        self.counts = np.zeros(self.free.shape, dtype=np.int64)
-
-    def visits(self) -> VisitMap:
-        """The counts so far; a copy."""
-        return VisitMap(self.counts.copy(), self.free)
-
-    def _on_step(self) -> bool:
-        self._count(self._last_positions())
-        return True
-
-    def _last_positions(self) -> FloatArray:
-        """Where the step ended, before any reset, shape ``(num_envs, 2)``."""
-        normaliser = self.model.get_vec_normalize_env()
-        raw = normaliser.get_original_obs() if normaliser else self.locals["new_obs"]
-        positions = _positions(raw).copy()
-        for i in np.flatnonzero(self.locals["dones"]):
-            last = self.locals["infos"][i]["terminal_observation"]
-            positions[i] = _positions(normaliser.unnormalize_obs(last) if normaliser else last)
-        return positions
-
-    def _count(self, positions: FloatArray) -> None:
-        n_rows, n_columns = self.free.shape
-        columns = np.floor(positions[:, 0] / CELL_SIZE + n_columns / 2).astype(int)
-        rows = np.floor(n_rows / 2 - positions[:, 1] / CELL_SIZE).astype(int)
-        cells = rows.clip(0, n_rows - 1) * n_columns + columns.clip(0, n_columns - 1)
-        self.counts += np.bincount(cells, minlength=self.free.size).reshape(self.free.shape)
+def draw(folder: Path, results: Sequence[Result]) -> None:
+    """Write the figure and the table of what has been run."""
+    seeds = {name: [run for run in results if run.cell.name == name] for name in PANELS}
+    seeds = {name: runs for name, runs in seeds.items() if runs}
+    maps = {
+        name: [VisitMap.load(run.cell.path(folder, ".npz")) for run in runs]
+        for name, runs in seeds.items()
+    }
+    density_figure({PANELS[name].title: maps[name] for name in maps}).savefig(
+        folder / "pointmaze.png"
+    )
+    (folder / "pointmaze.md").write_text(visits_table(seeds, maps) + "\n", encoding="utf-8")
 
 
-def _positions(observations: Any) -> FloatArray:
-    kinematic = observations["observation"] if isinstance(observations, dict) else observations
-    return np.asarray(kinematic, dtype=np.float64)[..., :2]
-
-
-def record_visits(model: BaseAlgorithm, total_timesteps: int) -> VisitMap:
-    """Train a model whose environment is a medium maze, and return where it went."""
-    counter = VisitCounter()
-    model.learn(total_timesteps, callback=counter)
-    return counter.visits()
-
-
-def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
-    """The maze for each run, coloured by visits on one common scale, with the two numbers below.
-
-    Several maps of one name are its seeds: their mean density, and the means of their numbers.
-
-    :param runs: visit maps by the panel's title
-    """
-    figure = Figure(figsize=(2.7 * len(runs) + 0.8, 3.2), dpi=DPI, layout="constrained")
-    panels = figure.subplots(1, len(runs), squeeze=False)[0]
-    for axes, (title, seeds) in zip(panels, runs.items(), strict=True):
-        maps = [seeds] if isinstance(seeds, VisitMap) else list(seeds)
-        _draw_density(axes, np.mean([each.density for each in maps], axis=0))
-        coverage = np.mean([each.coverage for each in maps])
-        entropy = np.mean([each.entropy for each in maps])
-        label = f"visited {coverage:.1%}   entropy {entropy:.2f}"
-        axes.set_title(title, fontsize=10, color=INK)
-        axes.set_xlabel(label, fontsize=8, color=INK)
-    bar = figure.colorbar(ScalarMappable(SCALE, COLOURS), ax=panels, shrink=0.75, aspect=24)
-    bar.set_label("visits relative to uniform", fontsize=8, color=INK)
-    bar.ax.tick_params(which="both", labelsize=7, labelcolor=INK, length=0)
-    bar.outline.set_visible(False)
-    return figure
-
-
-def _draw_density(axes: Axes, density: FloatArray) -> None:
-    """Walls grey, unvisited cells white; what is off the scale gets its nearest colour."""
-    visited = density.clip(*SCALE_LIMITS)
-    shown = np.where(density > 0, visited, np.where(np.isnan(density), np.nan, 1e-9))
-    half = len(density) * CELL_SIZE / 2
-    axes.imshow(shown, COLOURS, SCALE, extent=(-half, half, -half, half), interpolation="nearest")
-    _draw_marks(axes)
-    inside = half - 0.75
-    axes.set(xlim=(-inside, inside), ylim=(-inside, inside), xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
-
-
-def _draw_marks(axes: Axes) -> None:
-    maze = medium_maze()
-    goals = np.array([cell_centre(cell, maze) for cell in GOAL_CELLS])
-    start = cell_centre(START_CELL, maze)
-    for points, colour in ((goals, GOAL_COLOURS[4]), (start[None], GOAL_COLOURS[2])):
-        axes.scatter(
-            points[:, 0], points[:, 1], s=52, color=colour, edgecolors="white", linewidths=1.3
-        )
+def main(argv: list[str]) -> int:
+    """Train what is missing and make the figure."""
+    arguments = panel_parser("pointmaze", __doc__, PANELS, steps=2e6).parse_args(argv)
+    cells = panel_cells(PANELS, arguments, env=ENV_ID, keep_visits=True)
+    failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
+    draw(arguments.out, load_results(arguments.out))
+    return report_failures(failed)

@@ -31,6 +31,7 @@ class Cell:
     :param n_evaluations: Evaluations, evenly over the training, the last one at its end.
     :param n_episodes: Episodes of an evaluation, in each mode.
     :param n_trajectories: MultiGoal episodes from the centre to keep; 0 for none.
+    :param keep_visits: Whether to count where in the medium maze the training goes.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Cell:
     n_evaluations: int = 10
     n_episodes: int = 20
     n_trajectories: int = 0
+    keep_visits: bool = False
 
     def path(self, folder: Path, suffix: str) -> Path:
         """Where a file of it is, for instance with the suffix ".json"."""

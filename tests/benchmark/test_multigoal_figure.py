@@ -9,6 +9,7 @@ pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow.benchmark import multigoal
 from sb3_policyflow.benchmark.cell import train_cell
+from sb3_policyflow.benchmark.panels import panel_cells, panel_parser
 from sb3_policyflow.benchmark.results import Cell, load_results
 
 FAST = {"n_envs": 8, "n_steps": 8, "batch_size": 64, "n_epochs": 1}
@@ -39,7 +40,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_panels_are_the_papers() -> None:
-    cells = multigoal.panel_cells([0, 1, 2], steps=1000, n_evaluations=1, n_episodes=1)
+    parser = panel_parser("multigoal", None, multigoal.PANELS, steps=1000)
+    arguments = parser.parse_args(["--seeds", "0", "1", "2"])
+    cells = panel_cells(multigoal.PANELS, arguments, env=multigoal.ENV)
     assert len(cells) == 18
     assert {cell.algo for cell in cells} == {"ppo", "dppo", "fpo", "policyflow"}
     assert len({cell.path(Path(), ".json") for cell in cells}) == 18
