@@ -1,33 +1,54 @@
-"""Matrix products of blocks that fit into the first cache, and simpler loops."""
+"""Products of matrices that fit into the caches, and simpler loops."""
 
 from typing import Any
 
 import numpy as np
 
 from sb3_policyflow.fused.kernels.options import F, Floats, inner
+from sb3_policyflow.fused.kernels.tiles import (
+    LONG,
+    TALL,
+    WIDE,
+    half,
+    long,
+    slim,
+    tall_half,
+    tall_slim,
+    tall_wide,
+)
 
 
 @inner
 def accumulate(inputs: Any, weights: Floats, outputs: Floats) -> None:
-    """Outputs += inputs @ weights, eight terms at a time."""
-    n_in = weights.shape[0]
-    n_whole = n_in - n_in % 8
-    for k in range(0, n_whole, 8):
-        w0, w1, w2, w3 = weights[k], weights[k + 1], weights[k + 2], weights[k + 3]
-        w4, w5, w6, w7 = weights[k + 4], weights[k + 5], weights[k + 6], weights[k + 7]
-        for row in range(inputs.shape[0]):
-            x, y = inputs[row, k : k + 8], outputs[row]
-            x0, x1, x2, x3, x4, x5, x6, x7 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
-            for j in range(y.size):
-                first = (x0 * w0[j] + x1 * w1[j]) + (x2 * w2[j] + x3 * w3[j])
-                second = (x4 * w4[j] + x5 * w5[j]) + (x6 * w6[j] + x7 * w7[j])
-                y[j] += first + second
-    for k in range(n_whole, n_in):
-        w0 = weights[k]
-        for row in range(inputs.shape[0]):
-            x0, y = inputs[row, k], outputs[row]
-            for j in range(y.size):
-                y[j] += x0 * w0[j]
+    """Outputs += inputs @ weights, where rows of weights and outputs are contiguous."""
+    n_rows, n_columns = outputs.shape
+    n_tall, n_tiled = n_rows - n_rows % TALL, n_columns - n_columns % 4
+    for row in range(0, n_tall, TALL):
+        column = 0
+        while column + WIDE <= n_columns:
+            tall_wide(inputs, weights, outputs, row, column)
+            column += WIDE
+        if column + WIDE // 2 <= n_columns:
+            tall_half(inputs, weights, outputs, row, column)
+            column += WIDE // 2
+        while column < n_tiled:
+            tall_slim(inputs, weights, outputs, row, column)
+            column += 4
+    for row in range(n_tall, n_rows):
+        column = 0
+        while column + LONG <= n_columns:
+            long(inputs, weights, outputs, row, column)
+            column += LONG
+        while column + WIDE // 2 <= n_columns:
+            half(inputs, weights, outputs, row, column)
+            column += WIDE // 2
+        while column < n_tiled:
+            slim(inputs, weights, outputs, row, column)
+            column += 4
+    for row in range(n_rows):
+        for k in range(weights.shape[0]):
+            for j in range(n_tiled, n_columns):
+                outputs[row, j] += inputs[row, k] * weights[k, j]
 
 
 @inner
