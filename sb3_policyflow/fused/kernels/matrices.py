@@ -22,33 +22,45 @@ from sb3_policyflow.fused.kernels.tiles import (
 def accumulate(inputs: Any, weights: Floats, outputs: Floats) -> None:
     """Outputs += inputs @ weights, where rows of weights and outputs are contiguous."""
     n_rows, n_columns = outputs.shape
-    n_tall, n_tiled = n_rows - n_rows % TALL, n_columns - n_columns % 4
+    n_tall = n_rows - n_rows % TALL
     for row in range(0, n_tall, TALL):
-        column = 0
-        while column + WIDE <= n_columns:
-            tall_wide(inputs, weights, outputs, row, column)
-            column += WIDE
-        if column + WIDE // 2 <= n_columns:
-            tall_half(inputs, weights, outputs, row, column)
-            column += WIDE // 2
-        while column < n_tiled:
-            tall_slim(inputs, weights, outputs, row, column)
-            column += 4
+        _accumulate_tall(inputs, weights, outputs, row)
     for row in range(n_tall, n_rows):
-        column = 0
-        while column + LONG <= n_columns:
-            long(inputs, weights, outputs, row, column)
-            column += LONG
-        while column + WIDE // 2 <= n_columns:
-            half(inputs, weights, outputs, row, column)
-            column += WIDE // 2
-        while column < n_tiled:
-            slim(inputs, weights, outputs, row, column)
-            column += 4
+        _accumulate_row(inputs, weights, outputs, row)
     for row in range(n_rows):
         for k in range(weights.shape[0]):
-            for j in range(n_tiled, n_columns):
+            for j in range(n_columns - n_columns % 4, n_columns):
                 outputs[row, j] += inputs[row, k] * weights[k, j]
+
+
+@inner
+def _accumulate_tall(inputs: Any, weights: Floats, outputs: Floats, row: int) -> None:
+    """Do the rows of a tall tile, but for up to three last columns."""
+    n_columns, column = outputs.shape[1], 0
+    while column + WIDE <= n_columns:
+        tall_wide(inputs, weights, outputs, row, column)
+        column += WIDE
+    while column + WIDE // 2 <= n_columns:
+        tall_half(inputs, weights, outputs, row, column)
+        column += WIDE // 2
+    while column + 4 <= n_columns:
+        tall_slim(inputs, weights, outputs, row, column)
+        column += 4
+
+
+@inner
+def _accumulate_row(inputs: Any, weights: Floats, outputs: Floats, row: int) -> None:
+    """Do one row, but for up to three last columns."""
+    n_columns, column = outputs.shape[1], 0
+    while column + LONG <= n_columns:
+        long(inputs, weights, outputs, row, column)
+        column += LONG
+    while column + WIDE // 2 <= n_columns:
+        half(inputs, weights, outputs, row, column)
+        column += WIDE // 2
+    while column + 4 <= n_columns:
+        slim(inputs, weights, outputs, row, column)
+        column += 4
 
 
 @inner

@@ -39,27 +39,26 @@ def _make_tile(n_rows: int, n_columns: int) -> Any:
                 make_array(kind)(context, builder, array)
                 for kind, array in zip(signature.args[:3], arguments[:3], strict=True)
             ]
-            _emit(builder, *arrays, *arguments[3:], n_rows, n_columns)
+            _emit(builder, arrays, arguments[3:], (n_rows, n_columns))
             return context.get_dummy_value()
 
-        return types.void(inputs, weights, outputs, types.intp, types.intp), codegen
+        return types.void(inputs, weights, outputs, row, column), codegen
 
     return intrinsic(tile)
 
 
-def _emit(
-    builder: Any,
-    inputs: Any,
-    weights: Any,
-    outputs: Any,
-    row: Any,
-    column: Any,
-    n_rows: int,
-    n_columns: int,
-) -> None:
-    """Write a tile's instructions: load its sums, add all terms, store them."""
-    vector = ir.VectorType(_FLOAT, n_columns)
-    rows = [builder.add(row, ir.Constant(row.type, r)) for r in range(n_rows)]
+def _emit(builder: Any, arrays: Any, begin: Any, size: tuple[int, int]) -> None:
+    """Write a tile's instructions: load its sums, add all terms, store them.
+
+    :param builder: Takes the instructions.
+    :param arrays: Inputs, weights and outputs.
+    :param begin: Row and column of the outputs where the tile begins.
+    :param size: Rows and columns of the tile.
+    """
+    inputs, weights, outputs = arrays
+    row, column = begin
+    vector = ir.VectorType(_FLOAT, size[1])
+    rows = [builder.add(row, ir.Constant(row.type, r)) for r in range(size[0])]
     places = [_place(builder, outputs, r, column, vector) for r in rows]
     sums = [cgutils.alloca_once_value(builder, _load(builder, place)) for place in places]
     n_terms = cgutils.unpack_tuple(builder, weights.shape)[0]
