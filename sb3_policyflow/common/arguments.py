@@ -23,8 +23,9 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
     supported, ``max_grad_norm`` may be None or not positive for no clipping, and ``ent_coef`` may
     be a schedule; and:
 
-    :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``;
-        None to keep to ``learning_rate``.
+    :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
+        a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
+        keep to ``learning_rate``.
     :param lr_adaptation: When the adaptive learning rate moves: after each "epoch" or "minibatch".
     :param lr_factor: By how much it moves.
     :param lr_bounds: Its lowest and highest value.
@@ -74,7 +75,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
         *,
-        desired_kl: float | None = None,
+        desired_kl: Coefficient | None = None,
         lr_adaptation: str = "epoch",
         lr_factor: float = 1.5,
         lr_bounds: tuple[float, float] = (1e-6, 1e-2),
@@ -175,14 +176,15 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         self._entropy_schedule = parse_schedule("ent_coef", self.ent_coef)
         self._lr_rule: KLAdaptiveLearningRate | None = None
         if self.desired_kl is not None:
-            self._lr_rule = KLAdaptiveLearningRate(
-                self.desired_kl, self.lr_factor, self.kl_margin, self.lr_bounds
-            )
+            self._kl_schedule = parse_schedule("desired_kl", self.desired_kl)
+            if self._kl_schedule(1.0) == 0:
+                raise ValueError(f"desired_kl must be positive or None, got {self.desired_kl}.")
+            self._lr_rule = KLAdaptiveLearningRate(self.lr_factor, self.kl_margin, self.lr_bounds)
             if self.adaptive_learning_rate is None:
                 self.adaptive_learning_rate = self.lr_schedule(1.0)
 
     def _excluded_save_params(self) -> list[str]:
-        derived = ["_entropy_schedule", "_lr_rule"]
+        derived = ["_entropy_schedule", "_kl_schedule", "_lr_rule"]
         return [*super()._excluded_save_params(), *derived]
 
     def _now(self, schedule: Any) -> float:
@@ -203,5 +205,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         if self._lr_rule is None or self.adaptive_learning_rate is None:
             return
         kl = th.stack(divergences).mean().item()
-        self.adaptive_learning_rate = self._lr_rule.adapt(self.adaptive_learning_rate, kl)
+        self.adaptive_learning_rate = self._lr_rule.adapt(
+            self.adaptive_learning_rate, kl, self._now(self._kl_schedule)
+        )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)

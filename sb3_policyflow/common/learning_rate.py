@@ -11,35 +11,31 @@ class KLAdaptiveLearningRate:
 
     The rule of RSL-RL and skrl, on which the paper builds.
 
-    >>> rule = KLAdaptiveLearningRate(desired_kl=0.01)
-    >>> [round(rule.adapt(3e-4, kl), 7) for kl in (0.03, 0.01, 0.001)]
+    >>> rule = KLAdaptiveLearningRate()
+    >>> [round(rule.adapt(3e-4, kl, desired_kl=0.01), 7) for kl in (0.03, 0.01, 0.001)]
     [0.0002, 0.0003, 0.00045]
 
-    :param desired_kl: The target, in nats.
     :param factor: By how much the learning rate changes at a time.
     :param margin: How far off the target the divergence may be.
     :param bounds: Lowest and highest learning rate.
     :raises ValueError: If a parameter is out of its range.
     """
 
-    desired_kl: float
     factor: float = 1.5
     margin: float = 2.0
     bounds: tuple[float, float] = (1e-6, 1e-2)
 
     def __post_init__(self) -> None:
-        if self.desired_kl <= 0:
-            raise ValueError(f"desired_kl must be positive or None, got {self.desired_kl}.")
         if self.factor <= 1 or self.margin < 1:
             raise ValueError("lr_factor must be greater than 1 and kl_margin at least 1.")
         if not 0 < self.bounds[0] <= self.bounds[1]:
             raise ValueError(f"lr_bounds must be two positive numbers in order, got {self.bounds}.")
 
-    def adapt(self, learning_rate: float, kl: float) -> float:
-        """The learning rate after a divergence of ``kl`` nats was measured."""
+    def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
+        """The learning rate after a divergence of ``kl`` nats, of which ``desired_kl`` were meant."""
         lowest, highest = self.bounds
-        if kl > self.margin * self.desired_kl:
+        if kl > self.margin * desired_kl:
             return max(learning_rate / self.factor, lowest)
-        if kl < self.desired_kl / self.margin:
+        if kl < desired_kl / self.margin:
             return min(learning_rate * self.factor, highest)
         return learning_rate

@@ -119,7 +119,7 @@ class FPO(SampledEntropyMixin):
         action_noise_std: float = 0.0,
         n_entropy_actions: int = 8,
         n_entropy_states: int = 256,
-        desired_kl: float | None = None,
+        desired_kl: Coefficient | None = None,
         lr_adaptation: str = "epoch",
         lr_factor: float = 1.5,
         lr_bounds: tuple[float, float] = (1e-6, 1e-2),

@@ -126,7 +126,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         gaussian: bool = False,
         uniform_noise_coef: Coefficient = 0.0,
         log_ratio_clamp: float | None = None,
-        desired_kl: float | None = None,
+        desired_kl: Coefficient | None = None,
         lr_adaptation: str = "epoch",
         lr_factor: float = 1.5,
         lr_bounds: tuple[float, float] = (1e-6, 1e-2),

@@ -2,7 +2,7 @@ import pytest
 
 from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
 
-RULE = KLAdaptiveLearningRate(desired_kl=0.01, bounds=(1e-4, 1e-3))
+RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))
 
 
 @pytest.mark.parametrize(
@@ -17,15 +17,14 @@ RULE = KLAdaptiveLearningRate(desired_kl=0.01, bounds=(1e-4, 1e-3))
     ],
 )
 def test_rule(learning_rate: float, kl: float, expected: float) -> None:
-    assert RULE.adapt(learning_rate, kl) == pytest.approx(expected)
+    assert RULE.adapt(learning_rate, kl, desired_kl=0.01) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"desired_kl": 0.0}, "desired_kl must be positive"),
-        ({"desired_kl": 0.01, "factor": 1.0}, "lr_factor must be greater than 1"),
-        ({"desired_kl": 0.01, "bounds": (1e-2, 1e-6)}, "lr_bounds must be two positive"),
+        ({"factor": 1.0}, "lr_factor must be greater than 1"),
+        ({"bounds": (1e-2, 1e-6)}, "lr_bounds must be two positive"),
     ],
 )
 def test_senseless_rules_are_refused(options: dict[str, float], message: str) -> None:

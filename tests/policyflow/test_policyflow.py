@@ -264,6 +264,19 @@ def test_learning_rate_follows_the_divergence() -> None:
     assert rising[1] == 5e-4
 
 
+def test_divergence_to_follow_may_change() -> None:
+    model = PolicyFlow(
+        "MlpPolicy",
+        "Pendulum-v1",
+        n_steps=256,
+        seed=0,
+        desired_kl=lambda remaining: 10.0 if remaining > 0.4 else 1e-7,
+        lr_bounds=(1e-6, 5e-4),
+    )
+    model.learn(512)  # up to the bound, then down after each of ten epochs
+    assert model.adaptive_learning_rate == pytest.approx(5e-4 / 1.5**10)
+
+
 def test_target_kl_stops_the_update() -> None:
     model = PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=256, target_kl=1e-6, seed=0)
     model.learn(256)
