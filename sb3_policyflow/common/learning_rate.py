@@ -32,7 +32,7 @@ class KLAdaptiveLearningRate:
             raise ValueError(f"lr_bounds must be two positive numbers in order, got {self.bounds}.")
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
-        """The learning rate after a divergence of ``kl`` nats, of which ``desired_kl`` were meant."""
+        """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""
         lowest, highest = self.bounds
         if kl > self.margin * desired_kl:
             return max(learning_rate / self.factor, lowest)
