@@ -132,7 +132,7 @@ class FusedVelocityField(VelocityField):
             apply: Any = _FieldEvaluation.apply
             velocity = apply(parts, times, leading, *flat, *parts.tensors)
         else:
-            velocity = _run(parts, times, leading, *flat, keeps=False)[1].outputs
+            velocity, _ = _pass(parts, times, leading, *flat)[1].forth(keeps=False)
         return velocity.view_as(points)
 
 
@@ -206,19 +206,18 @@ class _Embedding:
         return grads
 
 
-def _run(
+def _pass(
     parts: FieldParts,
     times: th.Tensor,
     leading: th.Size,
     points: th.Tensor,
     features: th.Tensor,
-    keeps: bool,
 ) -> tuple[_Embedding, Pass]:
     embedding = _Embedding(parts, times.numpy(), features.detach().numpy())
     index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
     stride = parts.tensors[N_EMBEDDING].shape[1]
     first = FirstLayer(points.detach().numpy(), stride, embedding.table, index, embedding.shifts)
-    return embedding, Pass(parts.network, first, keeps)
+    return embedding, Pass(parts.network, first)
 
 
 class _FieldEvaluation(th.autograd.Function):
@@ -235,24 +234,27 @@ class _FieldEvaluation(th.autograd.Function):
         *tensors: th.Tensor,
     ) -> th.Tensor:
         ctx.arguments = parts, times, leading
-        ctx.embedding, ctx.way = _run(parts, times, leading, points, features, keeps=True)
-        ctx.save_for_backward(points, features, *tensors)
-        outputs: th.Tensor = ctx.way.outputs
+        ctx.embedding, ctx.way = _pass(parts, times, leading, points, features)
+        outputs: th.Tensor
+        outputs, kept = ctx.way.forth(keeps=True)
+        ctx.save_for_backward(kept, points, features, *tensors)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        points, features, *tensors = ctx.saved_tensors
+        kept, points, features, *tensors = ctx.saved_tensors
         if th.is_grad_enabled():
             parts, times, leading = ctx.arguments
             outputs = parts.plain(times, leading, points, features, tensors)
-            grads = differentiable_gradients(outputs, ctx.saved_tensors, grad_outputs)
+            grads = differentiable_gradients(outputs, ctx.saved_tensors[1:], grad_outputs)
             return None, None, None, *grads
         needs_points, needs_features = ctx.needs_input_grad[3:5]
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])
         embedding = ctx.embedding
-        flat, grad_shifts = ctx.way.back(tensors[N_EMBEDDING:], grad_outputs, grad_points.numpy())
+        flat, grad_shifts = ctx.way.back(
+            kept, tensors[N_EMBEDDING:], grad_outputs, grad_points.numpy()
+        )
         dim, (n_times, width) = points.shape[1], embedding.table.shape
         first = flat[: (dim + n_times) * width].view(-1, width).numpy()
         up_to_first = embedding.back(

@@ -31,29 +31,35 @@ class FirstLayer(NamedTuple):
 
 
 class Pass:
-    """One evaluation of a network, and the way back.
+    """An evaluation of a network, and the way back.
+
+    It holds on to neither outputs nor what is kept for the way back: they belong to autograd, which
+    knows when they are no longer needed.
 
     :param network: The network, of which the first layer's bias is not used.
     :param first: The first layer, evaluated.
-    :param keeps: Whether to keep what the way back needs.
     """
 
-    def __init__(self, network: Perceptron, first: FirstLayer, keeps: bool) -> None:
+    def __init__(self, network: Perceptron, first: FirstLayer) -> None:
         self._network, self._first = network, first
-        n_rows = len(first.inputs)
-        self._parts = n_parts(n_rows, network.work)
-        self.outputs = th.empty(n_rows, network.n_outputs)
-        self._kept = th.empty(2, n_rows * network.n_hidden if keeps else 0).numpy()
+        self._parts = n_parts(len(first.inputs), network.work)
+
+    def forth(self, keeps: bool) -> tuple[th.Tensor, th.Tensor]:
+        """The outputs, shape (n, n_outputs), and what the way back needs, if it is to be kept."""
+        network, n_rows = self._network, len(self._first.inputs)
+        outputs = th.empty(n_rows, network.n_outputs)
+        kept = th.empty(2, n_rows * network.n_hidden if keeps else 0)
         arguments = (
-            *first,
+            *self._first,
             addresses(network.parameters),
             network.widths,
             *network.activation,
-            self.outputs.numpy(),
-            *self._kept,
+            outputs.numpy(),
+            *kept.numpy(),
         )
         run = kernels().forward  # type: ignore[union-attr]
         self._in_parts(lambda _, start, stop: run(*arguments, start, stop))
+        return outputs, kept
 
     def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
         """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both ways.
@@ -70,10 +76,15 @@ class Pass:
         )
 
     def back(
-        self, parameters: Sequence[th.Tensor], grad_outputs: th.Tensor, grad_inputs: Array
+        self,
+        kept: th.Tensor,
+        parameters: Sequence[th.Tensor],
+        grad_outputs: th.Tensor,
+        grad_inputs: Array,
     ) -> tuple[th.Tensor, Array]:
         """The gradients of what has these gradients with respect to the outputs.
 
+        :param kept: What :meth:`forth` kept.
         :param parameters: Those of the network again.
         :param grad_outputs: Shape (n, n_outputs).
         :param grad_inputs: Filled; shape (n, n_inputs), or empty if it is not wanted.
@@ -91,7 +102,7 @@ class Pass:
             entries,
             addresses(parameters),
             network.widths,
-            *self._kept,
+            *kept.numpy(),
             grad_outputs.contiguous().numpy(),
         )
         after = (len(table), grad_shifts, grad_inputs)
@@ -107,29 +118,30 @@ class _PerceptronEvaluation(th.autograd.Function):
     def forward(
         ctx: Any, network: Perceptron, inputs: th.Tensor, *parameters: th.Tensor
     ) -> th.Tensor:
-        ctx.network, ctx.way = network, _run(network, inputs, keeps=True)
-        ctx.save_for_backward(inputs, *parameters)
-        outputs: th.Tensor = ctx.way.outputs
+        ctx.network, ctx.way = network, _pass(network, inputs)
+        outputs: th.Tensor
+        outputs, kept = ctx.way.forth(keeps=True)
+        ctx.save_for_backward(kept, inputs, *parameters)
         return outputs
 
     @staticmethod
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        inputs, *parameters = ctx.saved_tensors
+        kept, inputs, *parameters = ctx.saved_tensors
         if th.is_grad_enabled():
             outputs = ctx.network.plain(inputs, parameters)
-            return None, *differentiable_gradients(outputs, ctx.saved_tensors, grad_outputs)
+            return None, *differentiable_gradients(outputs, [inputs, *parameters], grad_outputs)
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
-        flat, _ = ctx.way.back(parameters, grad_outputs, grad_inputs.numpy())
+        flat, _ = ctx.way.back(kept, parameters, grad_outputs, grad_inputs.numpy())
         weight, *others = split_like(flat, parameters)
         weight = weight.view(inputs.shape[1], -1).T.contiguous()
         return None, grad_inputs if len(grad_inputs) else None, weight, *others
 
 
-def _run(network: Perceptron, inputs: th.Tensor, keeps: bool) -> Pass:
+def _pass(network: Perceptron, inputs: th.Tensor) -> Pass:
     table = network.parameters[1].detach().numpy()[None]
     no_shifts = np.zeros((0, table.shape[1]), dtype=np.float32)
     first = FirstLayer(inputs.detach().numpy(), inputs.shape[1], table, NOWHERE, no_shifts)
-    return Pass(network, first, keeps)
+    return Pass(network, first)
 
 
 def differentiable_gradients(
@@ -161,6 +173,6 @@ def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | N
         note_fallback("features or parameters are not contiguous float32 on the CPU")
         return None
     if not (th.is_grad_enabled() and any_needs_grad((inputs, *network.parameters))):
-        return _run(network, inputs, keeps=False).outputs
+        return _pass(network, inputs).forth(keeps=False)[0]
     apply: Any = _PerceptronEvaluation.apply
     return apply(network, inputs, *network.parameters)  # type: ignore[no-any-return]

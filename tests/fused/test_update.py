@@ -1,5 +1,7 @@
 """Training with kernels is training without, up to rounding."""
 
+import gc
+import weakref
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.optimisation import clip_gradients, make_optimizer
 from sb3_policyflow.fused.compiler import kernels
+from sb3_policyflow.fused.networks import Reader
+from sb3_policyflow.fused.perceptron import evaluate_perceptron
 from tests.common.test_collection import Clock
+from tests.fused.plain import make_field
 
 MISH = {"net_arch": [32, 16], "activation_fn": th.nn.Mish, "initialisation": "glorot"}
 
@@ -133,3 +138,43 @@ def test_an_optimizer_state_of_the_other_implementation_is_taken_over(tmp_path: 
     new.learn(32)
     steps = {int(state["step"]) for state in new.policy.optimizer.state.values()}
     assert steps == {2}
+
+
+def field_evaluation() -> th.Tensor:
+    field = make_field(2, 3, [8, 8])
+    velocity: th.Tensor = field(th.randn(5, 2), th.rand(5), th.randn(5, 3))
+    return velocity
+
+
+def perceptron_evaluation() -> th.Tensor:
+    network = Reader().perceptron([th.nn.Linear(2, 8), th.nn.Tanh(), th.nn.Linear(8, 1)])
+    assert network is not None
+    outputs = evaluate_perceptron(network, th.randn(5, 2))
+    assert outputs is not None
+    return outputs
+
+
+@pytest.mark.parametrize("evaluate", [field_evaluation, perceptron_evaluation])
+def test_nothing_outlives_the_graph(evaluate: Any) -> None:
+    """A cycle of references would hold what each minibatch has kept for the way back."""
+    gc.collect()
+    gc.disable()
+    try:
+        outputs = evaluate()
+        node: Any = outputs.grad_fn
+        while not hasattr(node, "way"):
+            node = node.next_functions[0][0]
+        way = weakref.ref(node.way)
+        assert way() is not None
+        del outputs, node
+        assert way() is None
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("evaluate", [field_evaluation, perceptron_evaluation])
+def test_what_was_kept_is_given_back_after_the_way_back(evaluate: Any) -> None:
+    loss = evaluate().sum()
+    loss.backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        loss.backward()
