@@ -71,9 +71,9 @@ def compare(real: Any, fake: Any) -> int:
     )
     assert_same(real.seed(3), fake.seed(3))
     assert_same(real.reset(), fake.reset())
-    episodes = 0
+    episodes, generator = 0, np.random.default_rng(0)
     for _ in range(N_STEPS):
-        actions = np.random.randn(N_ENVS, 2).astype(np.float32)
+        actions = generator.standard_normal((N_ENVS, 2), dtype=np.float32)
         one, other = real.step(actions), fake.step(actions)
         assert_same(one, other)
         episodes += int(one[2].sum())
