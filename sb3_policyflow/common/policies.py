@@ -213,7 +213,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
         :param obs: Observations of n environments.
         :param deterministic: Whether to draw nothing at random.
-        :return: Actions (n, *action shape), values (n, 1), and the record of the actions.
+        :return: Actions (n, ...), values (n, 1), and the record of the actions.
         """
         actor_features, critic_features = self.actor_critic_features(obs)
         actions, record = self.sample_actions(actor_features, deterministic)
