@@ -224,5 +224,5 @@ def statistics_of(checkpoint: Path) -> Path:
     >>> statistics_of(Path("logs/model.zip")).name
     'model_vecnormalize.pkl'
     """
-    prefix, steps = re.fullmatch(r"(.*?)(_\d+_steps)?", checkpoint.stem).groups("")  # type: ignore[union-attr]  # matches all
-    return checkpoint.with_name(f"{prefix}_vecnormalize{steps}.pkl")
+    name = re.sub(r"(_\d+_steps)?$", r"_vecnormalize\1", checkpoint.stem, count=1)
+    return checkpoint.with_name(f"{name}.pkl")
