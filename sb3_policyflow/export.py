@@ -19,15 +19,14 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.common.ode_policy import OdeFlowPolicy
 from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
-from sb3_policyflow.flows import integrate
+from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
 Observations = th.Tensor | dict[str, th.Tensor]
-ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO)
+ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO, DPPO)
 
 
 class NormalizeObservation(nn.Module):
@@ -58,8 +57,8 @@ class NormalizeObservation(nn.Module):
 class ActionModule(nn.Module):
     """The way from observations to actions, as ``predict(deterministic=True)`` goes it.
 
-    Normalisation, preprocessing, the flow's solver steps one after another, and the bounds of the
-    actions: tensors in, tensors out, nothing drawn at random.
+    Normalisation, preprocessing, the steps of the flow or of the denoising chain one after another,
+    and the bounds of the actions: tensors in, tensors out, nothing drawn at random.
 
     :param policy: The policy, of which a copy is taken.
     :param normalize: The environment's ``VecNormalize``, if it has one.
@@ -86,12 +85,14 @@ class ActionModule(nn.Module):
         :param observations: As the environment gives them, images with their channels first: a
             tensor (n, ...), or a dictionary of them.
         :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
-        :return: Actions within their bounds, shape (n, *action shape).
+        :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalised(observations))
-        actions = self._flow(features, latents).reshape(-1, *self.low.shape)
+        if latents is None:
+            latents = features.new_zeros(features.shape[0], self.policy.action_dim)
+        actions = self.policy.carry(latents, features).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
-            return self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
+            actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return actions.clamp(self.low, self.high)
 
     def _normalised(self, observations: Observations) -> Observations:
@@ -102,25 +103,10 @@ class ActionModule(nn.Module):
             }
         return self.normalisers["all"](observations) if self.normalisers else observations
 
-    def _flow(self, features: th.Tensor, latents: th.Tensor | None) -> th.Tensor:
-        policy = self.policy
-        if not isinstance(policy, OdeFlowPolicy):
-            return policy.sample_actions(features, deterministic=True)[0]
-        if latents is None:
-            latents = features.new_zeros(features.shape[0], policy.action_dim)
-        return integrate(
-            lambda points, time: policy.velocity(points, time, features),
-            latents,
-            n_steps=policy.n_flow_steps,
-            solver=policy.solver,
-            end_time=policy.path.end_time,
-        )
-
     def example(self, latents: bool = False) -> tuple[Any, ...]:
         """Arguments of :meth:`forward` for a batch of two.
 
         :param latents: Whether to include some.
-        :raises ValueError: If the policy has none to give.
         """
         space = self.policy.observation_space
         if isinstance(space, spaces.Dict):
@@ -129,11 +115,6 @@ class ActionModule(nn.Module):
             observations = self._zeros("all", space)
         if not latents:
             return (observations,)
-        if not isinstance(self.policy, OdeFlowPolicy):
-            raise ValueError(
-                f"{type(self.policy).__name__} draws noise in every step, so its latents alone do "
-                "not decide the action: leave them out."
-            )
         return observations, th.zeros(2, self.policy.action_dim)
 
     def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
@@ -171,7 +152,7 @@ def export(
     :param normalize: The environment's ``VecNormalize``, if it has one: then the file takes
         observations that are not normalised yet.
     :param latents: Whether latents z, shape (n, action_dim), are an input; they are 0 otherwise.
-    :raises ValueError: If the file is to be of another kind, or the policy has no latents to give.
+    :raises ValueError: If the file is to be of another kind.
     """
     path = Path(path)
     if path.suffix not in (".onnx", ".pt2"):

@@ -10,10 +10,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.diagnostics import FlowDiagnosticsCallback, end_point_shifts
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
-from sb3_policyflow.fpo import FPO
 
 SMALL: dict[str, Any] = {
     "n_steps": 32,
@@ -105,11 +104,18 @@ def test_entropy_of_a_policy_that_is_gaussian() -> None:
     assert collector.logged[-1]["kl_exact"] == 0.0
 
 
-def test_other_algorithms() -> None:
-    collector = Collector()
-    model = FPO("MlpPolicy", environment(), **SMALL)
-    model.learn(512, [FlowDiagnosticsCallback(n_samples=16), collector])
-    assert list(collector.logged[-1]) == ["action_entropy"]
+@pytest.mark.parametrize("algorithm", [FPO, DPPO])
+def test_other_algorithms(algorithm: type[Any]) -> None:
+    runs = []
+    for callbacks in ([], [FlowDiagnosticsCallback(n_samples=16), Collector()]):
+        options = {name: value for name, value in SMALL.items() if name != "n_flow_steps"}
+        model = algorithm("MlpPolicy", environment(), **options).learn(512, callbacks)
+        runs.append(th.cat([parameter.flatten() for parameter in model.policy.parameters()]))
+    assert list(callbacks[1].logged[-1]) == ["action_entropy"]
+    assert th.equal(*runs)
+
+
+def test_algorithms_without_a_flow() -> None:
     with pytest.raises(ValueError, match=r"looks at flow policies, .* not at PPO"):
         PPO("MlpPolicy", "Pendulum-v1").learn(16, FlowDiagnosticsCallback())
 

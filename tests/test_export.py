@@ -15,15 +15,20 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.export import ActionModule, export, main
-from sb3_policyflow.fpo import FPO
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2, "n_flow_steps": 2}
+EACH = pytest.mark.parametrize("algorithm", [PolicyFlow, FPO, DPPO])
+SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
 NETS = {"net_arch": [16], "embedding_dim": 8, "initialisation": "glorot"}
+STEPS: dict[type[Any], dict[str, Any]] = {
+    PolicyFlow: {"n_flow_steps": 2, "solver": "midpoint"},
+    FPO: {"n_flow_steps": 2, "solver": "heun"},
+    DPPO: {"n_denoising_steps": 4, "n_finetuned_steps": 2},
+}
 
 
 class Robot(gym.Env[Any, Any]):
@@ -56,7 +61,8 @@ def images() -> gym.Env[Any, Any]:
 
 
 def trained(algorithm: type[Any], policy: str, env: VecEnv | str, **options: Any) -> Any:
-    return algorithm(policy, env, policy_kwargs=NETS, seed=0, **{**SMALL, **options}).learn(64)
+    options = {**SMALL, **STEPS[algorithm], **options}
+    return algorithm(policy, env, policy_kwargs=NETS, seed=0, **options).learn(64)
 
 
 def raw_and_normalised(env: VecNormalize) -> tuple[Any, Any]:
@@ -73,10 +79,10 @@ def run_onnx(path: Path, observations: Any, **more: np.ndarray) -> np.ndarray:
     return np.asarray(actions)
 
 
-@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+@EACH
 def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 3))
-    model = trained(algorithm, "MlpPolicy", env, solver="midpoint")
+    model = trained(algorithm, "MlpPolicy", env)
     export(model.policy, tmp_path / "policy.onnx", normalize=env)
     raw, normalised = raw_and_normalised(env)
     expected, _ = model.predict(normalised, deterministic=True)
@@ -86,7 +92,7 @@ def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     assert expected.std() > 0
 
 
-@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+@EACH
 def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     model = trained(algorithm, "CnnPolicy", make_vec_env(images, 2))
     export(model.policy, tmp_path / "policy.onnx")
@@ -95,7 +101,7 @@ def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", pictures), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO])
+@EACH
 def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env(Robot, 3), norm_obs_keys=["joints"])
     model = trained(algorithm, "MultiInputPolicy", env)
@@ -110,12 +116,19 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "solver"), [("trigflow", "rk4"), ("rectified", "ab2"), ("rectified", "heun")]
+    ("algorithm", "options"),
+    [
+        (PolicyFlow, {"path": "trigflow", "solver": "rk4"}),
+        (PolicyFlow, {"path": "rectified", "solver": "ab2"}),
+        (FPO, {"solver": "heun"}),
+        (DPPO, {"process": "flow"}),
+    ],
+    ids=str,
 )
 def test_latents_are_carried_as_the_policy_carries_them(
-    path: str, solver: str, tmp_path: Path
+    algorithm: type[Any], options: dict[str, Any], tmp_path: Path
 ) -> None:
-    model = trained(PolicyFlow, "MlpPolicy", "Pendulum-v1", path=path, solver=solver)
+    model = trained(algorithm, "MlpPolicy", "Pendulum-v1", **options)
     export(model.policy, tmp_path / "policy.onnx", latents=True)
     obs = np.stack([model.observation_space.sample() for _ in range(5)])
     latents = np.random.randn(5, 1).astype(np.float32)
@@ -124,6 +137,24 @@ def test_latents_are_carried_as_the_policy_carries_them(
         endpoints = model.policy.carry(th.as_tensor(latents), features).clamp(-2, 2)
     actions = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
     np.testing.assert_allclose(actions, endpoints, atol=1e-5)
+    assert np.ptp(actions) > 0.1
+
+
+def test_a_chain_without_noise_is_the_record_of_its_means(tmp_path: Path) -> None:
+    """DPPO's file with latents takes, from where a drawn chain starts, each step to its mean."""
+    model = trained(DPPO, "MlpPolicy", "Pendulum-v1", noise_clip=1e-9, n_finetuned_steps=None)
+    export(model.policy, tmp_path / "policy.onnx", latents=True)
+    obs = np.stack([model.observation_space.sample() for _ in range(5)])
+    with th.no_grad():
+        actions, _, record = model.policy(th.as_tensor(obs))
+    latents = record.points[:, 0].numpy()
+    expected = model.policy.unscale_action(actions.numpy())
+    found = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    # Drawing the start in predict is for evaluation, and not what is exported.
+    model.policy.random_latents = True
+    module = ActionModule(model.policy)
+    assert th.equal(module(th.as_tensor(obs)), module(th.as_tensor(obs)))
 
 
 WITHOUT_THIS_PACKAGE = """
@@ -142,12 +173,12 @@ np.save("actions.npy", actions)
 """
 
 
-@pytest.mark.parametrize("kind", ["onnx", "pt2"])
+@pytest.mark.parametrize(("algorithm", "kind"), [(PolicyFlow, "onnx"), (DPPO, "pt2")])
 def test_command_line_writes_files_that_load_without_this_package(
-    kind: str, tmp_path: Path
+    algorithm: type[Any], kind: str, tmp_path: Path
 ) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 3))
-    model = trained(PolicyFlow, "MlpPolicy", env)
+    model = trained(algorithm, "MlpPolicy", env)
     model.save(tmp_path / "model.zip")
     env.save(str(tmp_path / "stats.pkl"))
     raw, normalised = raw_and_normalised(env)
@@ -162,12 +193,14 @@ def test_command_line_writes_files_that_load_without_this_package(
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=1e-5)
 
 
-def test_the_module_itself_and_the_bounds_of_actions() -> None:
-    model = trained(FPO, "MlpPolicy", "Pendulum-v1")
+@pytest.mark.parametrize(("algorithm", "bound"), [(FPO, 2.0), (DPPO, -2.0)])
+def test_the_module_itself_and_the_bounds_of_actions(algorithm: type[Any], bound: float) -> None:
+    """DPPO's network predicts the noise, which points away from the action."""
+    model = trained(algorithm, "MlpPolicy", "Pendulum-v1")
     with th.no_grad():
         model.policy.velocity.output.bias.fill_(100.0)
     obs = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(4)]))
-    assert (ActionModule(model.policy)(obs) == 2.0).all()
+    assert (ActionModule(model.policy)(obs) == bound).all()
 
 
 def test_what_cannot_be_exported(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def _train(
     """Train, and say what it came to and what it took."""
     gradient_steps = costs.GradientSteps(model)
     start = time.perf_counter()
-    model.learn(steps, callback=[*callbacks, evaluations], log_interval=None)  # type: ignore[arg-type]
+    model.learn(steps, callback=[*callbacks, evaluations], log_interval=None)  # type: ignore[arg-type]  # SB3 takes None
     seconds = time.perf_counter() - start - evaluations.seconds
     last = evaluations.curve[-1]["timesteps"]
     final = {row["mode"]: row for row in evaluations.curve if row["timesteps"] == last}

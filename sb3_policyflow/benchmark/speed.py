@@ -30,7 +30,8 @@ def predict_times(repetitions: int) -> dict[str, Any]:
     """Prediction of one action for HalfCheetah-v5, as a robot or ``enjoy`` asks for it."""
     setting = halfcheetah()
     models = {name: make() for name, make in setting.makers.items()}
-    observation = models["PPO"].env.reset()[0]  # type: ignore[union-attr, index]
+    env: Any = models["PPO"].env
+    observation = env.reset()[0]
     calls = {
         name: partial(model.predict, observation, deterministic=True)
         for name, model in models.items()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch as th
 
@@ -80,8 +81,13 @@ def clipped_surrogate(
     :return: The objective, shape (...).
     """
     ratio = log_ratio.exp()
-    clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)  # type: ignore[arg-type]
+    clipped = _clamp(ratio, 1 - clip_range, 1 + clip_range)
     return th.min(ratio * advantages, clipped * advantages)
+
+
+def _clamp(values: th.Tensor, low: Any, high: Any) -> th.Tensor:
+    """What torch knows with two numbers and with two tensors, but not of either kind."""
+    return values.clamp(low, high)
 
 
 def penalised_surrogate(

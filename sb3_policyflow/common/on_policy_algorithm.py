@@ -157,7 +157,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         """
         for parameter in parameters:
             parameter.grad = None
-        loss.backward()  # type: ignore[no-untyped-call]
+        th.autograd.backward(loss)
         clips = self.max_grad_norm is not None and self.max_grad_norm > 0
         norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
         if not (math.isfinite(norm) and th.isfinite(loss)):

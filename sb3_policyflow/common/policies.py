@@ -187,6 +187,15 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         return draw(size, device=features.device, dtype=features.dtype)
 
     @abstractmethod
+    def carry(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Carry latents to actions, with no noise on the way nor at the end.
+
+        :param latents: z, shape (n, action_dim).
+        :param features: The actor's features, shape (n, features_dim).
+        :return: Shape (n, action_dim).
+        """
+
+    @abstractmethod
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, Any]:
@@ -204,7 +213,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
         :param obs: Observations of n environments.
         :param deterministic: Whether to draw nothing at random.
-        :return: Actions (n, *action shape), values (n, 1), and the record of the actions.
+        :return: Actions (n, ...), values (n, 1), and the record of the actions.
         """
         actor_features, critic_features = self.actor_critic_features(obs)
         actions, record = self.sample_actions(actor_features, deterministic)

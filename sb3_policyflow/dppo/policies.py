@@ -3,6 +3,7 @@
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
@@ -140,16 +141,38 @@ class DPPOPolicy(FlowActorCriticPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, DPPORecord]:
         """Draw actions; the deterministic one starts at 0 and each step goes to its mean."""
-        points, means = [self.draw_latents(features, deterministic)], []
-        stds = self.process.stds.clamp(min=self.min_sampling_std)
-        for step in range(self.n_denoising_steps):
-            means.append(self._means(points[-1], step, features))
-            points.append(means[-1] if deterministic else self._noisy(means[-1], stds[step]))
+        latents = self.draw_latents(features, deterministic)
+        points, means = self._chain(latents, features, is_noisy=not deterministic)
         record = DPPORecord(
             th.stack(points[self.n_frozen_steps :], dim=1),
             th.stack(means[self.n_frozen_steps :], dim=1),
         )
-        return points[-1].clamp(-1, 1) if self.squash_output else points[-1], record
+        return self._bounded(points[-1]), record
+
+    def carry(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Carry latents x_0 along the means of all steps, see :class:`FlowActorCriticPolicy`."""
+        points, _ = self._chain(latents, features, is_noisy=False)
+        return self._bounded(points[-1])
+
+    def _chain(
+        self, latents: th.Tensor, features: th.Tensor, is_noisy: bool
+    ) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """The K + 1 points of a chain, and the K means around which all but the first lie."""
+        points, means = [latents], list[th.Tensor]()
+        stds = self.process.stds.clamp(min=self.min_sampling_std)
+        for step in range(self.n_denoising_steps):
+            means.append(self._means(points[-1], step, features))
+            points.append(self._noisy(means[-1], stds[step]) if is_noisy else means[-1])
+        return points, means
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        """Scale actions from [-1, 1] to their space, see SB3, whose rounding may leave it."""
+        box = self.action_space
+        assert isinstance(box, spaces.Box)
+        return super().unscale_action(scaled_action).clip(box.low, box.high)
+
+    def _bounded(self, actions: th.Tensor) -> th.Tensor:
+        return actions.clamp(-1, 1) if self.squash_output else actions
 
     def _noisy(self, means: th.Tensor, std: th.Tensor) -> th.Tensor:
         noise = th.randn_like(means)

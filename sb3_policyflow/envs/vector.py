@@ -72,11 +72,12 @@ class GymVectorVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
+        observations: VecEnvObs
         observations, infos = self.env.reset(seed=self._seeds[0], options=self._shared_options())
         self.reset_infos = unbatch_infos(infos, self.num_envs)
         self._reset_seeds()
         self._reset_options()
-        return observations  # type: ignore[no-any-return]
+        return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = actions
@@ -102,8 +103,8 @@ class GymVectorVecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        frames = self.env.render()
-        return [None] * self.num_envs if frames is None else list(frames)  # type: ignore[arg-type]
+        frames: Any = self.env.render()
+        return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         if self._sub_envs is not None:

@@ -158,7 +158,8 @@ class _Embedding:
         table = np.empty((n_times, width), dtype=np.float32)
         self.index = np.empty(n_times, dtype=np.int64)
         self.shifts = np.empty((len(features), width), dtype=np.float32)
-        n_distinct = kernels().embed(  # type: ignore[union-attr]
+        module: Any = kernels()
+        n_distinct = module.embed(
             self._times,
             self.index,
             self._n_frequencies,
@@ -190,7 +191,8 @@ class _Embedding:
         """
         tensors = tensors[: N_EMBEDDING + 2]
         grads = th.empty(sum(tensor.numel() for tensor in tensors[1:]))
-        kernels().embed_backward(  # type: ignore[union-attr]
+        module: Any = kernels()
+        module.embed_backward(
             self._times,
             self._n_frequencies,
             self._features,

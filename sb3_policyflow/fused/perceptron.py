@@ -57,7 +57,8 @@ class Pass:
             outputs.numpy(),
             *kept.numpy(),
         )
-        run = kernels().forward  # type: ignore[union-attr]
+        module: Any = kernels()
+        run = module.forward
         self._in_parts(lambda _, start, stop: run(*arguments, start, stop))
         return outputs, kept
 
@@ -106,7 +107,8 @@ class Pass:
             grad_outputs.contiguous().numpy(),
         )
         after = (len(table), grad_shifts, grad_inputs)
-        flat, run = grads.numpy(), kernels().backward  # type: ignore[union-attr]
+        module: Any = kernels()
+        flat, run = grads.numpy(), module.backward
         self._in_parts(lambda part, start, stop: run(*before, flat[part], *after, start, stop))
         return grads[0] if self._parts == 1 else grads.sum(0), grad_shifts
 
@@ -156,7 +158,7 @@ def differentiable_gradients(
 def split_like(flat: th.Tensor, tensors: Sequence[th.Tensor]) -> list[th.Tensor]:
     """Parts of a tensor that have the shapes of others."""
     sizes = [tensor.numel() for tensor in tensors]
-    parts: Any = flat.split(sizes)  # type: ignore[no-untyped-call]
+    parts = th.split(flat, sizes)
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
@@ -174,5 +176,5 @@ def evaluate_perceptron(network: Perceptron, inputs: th.Tensor) -> th.Tensor | N
         return None
     if not (th.is_grad_enabled() and any_needs_grad((inputs, *network.parameters))):
         return _pass(network, inputs).forth(keeps=False)[0]
-    apply: Any = _PerceptronEvaluation.apply
-    return apply(network, inputs, *network.parameters)  # type: ignore[no-any-return]
+    apply: Callable[..., th.Tensor] = _PerceptronEvaluation.apply
+    return apply(network, inputs, *network.parameters)

@@ -92,5 +92,6 @@ def _extend_experiments(exp_manager: ModuleType) -> None:
         given = signature.bind(self, *args, **kwargs).arguments
         extend_experiment(self, own_algorithms=ALGORITHMS, config_given=bool(given.get("config")))
 
-    construct_and_extend.extended_by_sb3_policyflow = True  # type: ignore[attr-defined]
-    manager_class.__init__ = construct_and_extend
+    extended: Any = construct_and_extend
+    extended.extended_by_sb3_policyflow = True
+    manager_class.__init__ = extended

@@ -48,7 +48,7 @@ def draws() -> list[float]:
 # Exact resume
 
 
-@pytest.mark.parametrize("algorithm", ["PolicyFlow", "FPO"])
+@pytest.mark.parametrize("algorithm", ["PolicyFlow", "FPO", "DPPO"])
 def test_resumed_runs_equal_each_other_and_the_uninterrupted_one(
     algorithm: str, tmp_path: Path
 ) -> None:

@@ -19,17 +19,13 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.fpo import FPO
 
-MODELS: list[type[Any]] = [PolicyFlow, FPO]
 SMALL: dict[str, Any] = {
     "n_steps": 16,
     "batch_size": 8,
     "n_epochs": 1,
-    "n_flow_steps": 2,
     "policy_kwargs": {"net_arch": [8]},
 }
-EACH = pytest.mark.parametrize("model_class", MODELS)
 
 
 def identity() -> DummyVecEnv:
@@ -44,7 +40,6 @@ def flat(model: Any) -> th.Tensor:
     return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
 
 
-@EACH
 def test_save_load(model_class: type[Any], tmp_path: Path) -> None:
     model = make(model_class, seed=1).learn(32)
     env = model.get_env()
@@ -72,7 +67,6 @@ def test_save_load(model_class: type[Any], tmp_path: Path) -> None:
         model_class.load(tmp_path / "test_save.zip", policy_kwargs={"net_arch": [16]})
 
 
-@EACH
 def test_set_env(model_class: type[Any], tmp_path: Path) -> None:
     env, other, third = identity(), identity(), IdentityEnvBox(-10, 10)
     model = make(model_class, seed=1)
@@ -92,7 +86,6 @@ def test_set_env(model_class: type[Any], tmp_path: Path) -> None:
         model.set_env(make_vec_env("Pendulum-v1"))
 
 
-@EACH
 def test_load_with_another_number_of_environments(model_class: type[Any], tmp_path: Path) -> None:
     make(model_class).learn(16).save(tmp_path / "model")
     env = make_vec_env(lambda: IdentityEnvBox(-10, 10), 3)
@@ -102,7 +95,6 @@ def test_load_with_another_number_of_environments(model_class: type[Any], tmp_pa
         model_class.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"))
 
 
-@EACH
 def test_exclude_include_saved_params(model_class: type[Any], tmp_path: Path) -> None:
     model = make(model_class, verbose=2)
     model.save(tmp_path / "test_save", exclude=["verbose"])
@@ -111,7 +103,6 @@ def test_exclude_include_saved_params(model_class: type[Any], tmp_path: Path) ->
     assert model_class.load(tmp_path / "test_save").verbose == 2
 
 
-@EACH
 def test_custom_objects(model_class: type[Any], tmp_path: Path) -> None:
     make(model_class, learning_rate=1e-3).save(tmp_path / "model")
     changed = {"learning_rate": 5e-4, "clip_range": 0.1}
@@ -119,7 +110,6 @@ def test_custom_objects(model_class: type[Any], tmp_path: Path) -> None:
     assert (loaded.learning_rate, loaded.clip_range(1.0)) == (5e-4, 0.1)
 
 
-@EACH
 def test_get_and_set_parameters(model_class: type[Any], tmp_path: Path) -> None:
     model, other = make(model_class).learn(16), make(model_class)
     parameters = model.get_parameters()
@@ -137,7 +127,6 @@ def test_get_and_set_parameters(model_class: type[Any], tmp_path: Path) -> None:
         other.set_parameters({"critic": parameters["policy"]})
 
 
-@EACH
 def test_save_load_env_cnn(model_class: type[Any], tmp_path: Path) -> None:
     env = FakeImageEnv(screen_height=40, screen_width=40, n_channels=2, discrete=False)
     options = {**SMALL, "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 8}}}
@@ -146,7 +135,6 @@ def test_save_load_env_cnn(model_class: type[Any], tmp_path: Path) -> None:
     model.learn(16)
 
 
-@EACH
 @pytest.mark.parametrize("policy_str", ["MlpPolicy", "CnnPolicy"])
 def test_save_load_policy(model_class: type[Any], policy_str: str, tmp_path: Path) -> None:
     options = SMALL
@@ -189,7 +177,6 @@ def test_open_file(tmp_path: Path) -> None:
             PolicyFlow.load(as_text)
 
 
-@EACH
 def test_save_load_large_model(model_class: type[Any], tmp_path: Path) -> None:
     """More than the 2 GB of an old zip would take minutes; 30 MB go the same way."""
     options = {**SMALL, "policy_kwargs": {"net_arch": [1024, 1024]}}
@@ -233,24 +220,22 @@ def test_cast_lr_schedule(tmp_path: Path) -> None:
     assert PolicyFlow.load(tmp_path / "model").lr_schedule(1.0) == pytest.approx(1e-3)
 
 
-@EACH
 def test_save_load_net_arch_none(model_class: type[Any], tmp_path: Path) -> None:
     model_class("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": None}).save(tmp_path / "m")
     model_class.load(tmp_path / "m")
 
 
-@EACH
 def test_save_load_clip_range_portable(model_class: type[Any], tmp_path: Path) -> None:
     make(model_class, clip_range=0.3, clip_range_vf=0.4).save(tmp_path / "m")
     loaded = model_class.load(tmp_path / "m")
     assert (loaded.clip_range(0.5), loaded.clip_range_vf(0.5)) == (0.3, 0.4)
 
 
-def test_compiled_policy(tmp_path: Path) -> None:
-    model = make(PolicyFlow, seed=0)
+def test_compiled_policy(model_class: type[Any], tmp_path: Path) -> None:
+    model = make(model_class, seed=0)
     model.policy = th.compile(model.policy, backend="eager")  # others take minutes
     model.learn(16)
     model.save(tmp_path / "model")
-    loaded = PolicyFlow.load(tmp_path / "model", env=identity())
+    loaded = model_class.load(tmp_path / "model", env=identity())
     assert th.equal(flat(loaded), flat(model))
     loaded.learn(16)

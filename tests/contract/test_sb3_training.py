@@ -31,14 +31,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_env
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
 from sb3_policyflow.envs.vector import GymVectorVecEnv
-from sb3_policyflow.fpo import FPO
 
-EACH = pytest.mark.parametrize("model_class", [PolicyFlow, FPO])
 SMALL: dict[str, Any] = {
     "n_steps": 32,
     "batch_size": 16,
     "n_epochs": 1,
-    "n_flow_steps": 2,
     "policy_kwargs": {"net_arch": [8]},
     "seed": 0,
 }
@@ -55,7 +52,6 @@ def weights(model: Any) -> th.Tensor:
 # Callbacks
 
 
-@EACH
 def test_callbacks(model_class: type[Any], tmp_path: Path) -> None:
     model = make(model_class, IdentityEnvBox(-10, 10))
     evaluation = Monitor(IdentityEnvBox(-10, 10))
@@ -88,7 +84,6 @@ def test_callbacks(model_class: type[Any], tmp_path: Path) -> None:
     model.learn(64, callback=[StopTrainingOnMaxEpisodes(max_episodes=10**6)])
 
 
-@EACH
 def test_callback_that_stops(model_class: type[Any]) -> None:
     model = make(model_class)
     model.learn(64, callback=lambda local_variables, _: local_variables["self"].num_timesteps < 20)
@@ -105,7 +100,6 @@ def test_stop_on_reward_threshold() -> None:
     assert model.num_timesteps == 40
 
 
-@EACH
 def test_eval_callback_vec_env(model_class: type[Any]) -> None:
     env = make_vec_env(lambda: IdentityEnvBox(-10, 10), 2)
     model = make(model_class, IdentityEnvBox(-10, 10))
@@ -131,7 +125,6 @@ class Outcome(gym.Env[Any, Any]):
         return np.zeros(2, np.float32), 1.0, self.time == 5, False, info
 
 
-@EACH
 def test_eval_success_logging(model_class: type[Any], tmp_path: Path) -> None:
     model = make(model_class, Outcome())
     model.set_logger(configure(str(tmp_path), ["json"]))
@@ -147,7 +140,6 @@ def test_eval_success_logging(model_class: type[Any], tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.load(tmp_path / "evaluations.npz")["timesteps"][0], 32)
 
 
-@EACH
 def test_eval_friendly_error(model_class: type[Any]) -> None:
     """Normalised training is not evaluated without normalisation."""
     train = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
@@ -158,7 +150,6 @@ def test_eval_friendly_error(model_class: type[Any]) -> None:
         model.learn(32, callback)
 
 
-@EACH
 def test_checkpoint_additional_info(model_class: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1"))
     model = make(model_class, env)
@@ -174,7 +165,6 @@ def test_checkpoint_additional_info(model_class: type[Any], tmp_path: Path) -> N
 # Learning again
 
 
-@EACH
 def test_learn_twice(model_class: type[Any]) -> None:
     model = make(model_class).learn(64)
     assert (model.num_timesteps, model._n_updates) == (64, 2)
@@ -185,7 +175,6 @@ def test_learn_twice(model_class: type[Any]) -> None:
     assert model._current_progress_remaining <= 0.01
 
 
-@EACH
 def test_learn_in_parts_goes_on_in_the_same_episode(model_class: type[Any]) -> None:
     resets = []
 
@@ -212,7 +201,6 @@ class LogLines(BaseCallback):
         self.keys = set(self.logger.name_to_value)
 
 
-@EACH
 @pytest.mark.parametrize(
     "formats", [["stdout"], ["log"], ["csv"], ["json"], ["tensorboard"]], ids=str
 )
@@ -253,7 +241,6 @@ def test_tensorboard_folders_are_numbered(tmp_path: Path) -> None:
 # Normalisation
 
 
-@EACH
 def test_vec_normalize_and_sync(model_class: type[Any]) -> None:
     def normalised() -> VecNormalize:
         return VecNormalize(make_vec_env("Pendulum-v1", 2), clip_obs=5.0)
@@ -273,7 +260,6 @@ def test_goal_env() -> None:
     evaluate_policy(model, Monitor(env), 2, warn=False)
 
 
-@EACH
 def test_native_vector_environments_train_as_dummy_ones(model_class: type[Any]) -> None:
     mode = gym.vector.AutoresetMode.SAME_STEP
     native = GymVectorVecEnv(gym.vector.SyncVectorEnv([Outcome] * 2, autoreset_mode=mode))
@@ -286,7 +272,6 @@ def test_native_vector_environments_train_as_dummy_ones(model_class: type[Any]) 
 # PPO's own
 
 
-@EACH
 @pytest.mark.parametrize("clip_range_vf", [None, 0.2, -0.2])
 def test_ppo(model_class: type[Any], clip_range_vf: float | None) -> None:
     if clip_range_vf is not None and clip_range_vf < 0:
@@ -296,7 +281,6 @@ def test_ppo(model_class: type[Any], clip_range_vf: float | None) -> None:
         make(model_class, clip_range_vf=clip_range_vf).learn(64)
 
 
-@EACH
 def test_ppo_warnings(model_class: type[Any]) -> None:
     with pytest.warns(UserWarning, match="the last minibatch of each epoch will have"):
         make(model_class, n_steps=63)
@@ -307,7 +291,6 @@ def test_ppo_warnings(model_class: type[Any]) -> None:
         make(model_class, n_steps=2, batch_size=2)
 
 
-@EACH
 @pytest.mark.parametrize("normalize_advantage", [False, True])
 def test_advantage_normalization(model_class: type[Any], normalize_advantage: bool) -> None:
     make(model_class, normalize_advantage=normalize_advantage).learn(64)

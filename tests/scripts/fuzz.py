@@ -18,8 +18,7 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_policyflow import PolicyFlow
-from sb3_policyflow.fpo import FPO
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 
 OUTCOMES: Counter[str] = Counter()
 
@@ -100,12 +99,19 @@ common: dict[str, st.SearchStrategy[Any]] = {
     "kl_window": st.sampled_from(["epoch", "update"]),
     "advantage_scope": st.sampled_from(["minibatch", "rollout"]),
     "timeout_bootstrap": st.sampled_from(["terminal", "current", "none"]),
+}
+ode: dict[str, st.SearchStrategy[Any]] = {
     "solver": st.sampled_from(["euler", "midpoint", "heun", "rk4", "ab2"]),
     "n_flow_steps": st.integers(1, 3),
     "time_sampler": st.sampled_from(["grid", "starts", "uniform"]),
 }
+entropy: dict[str, st.SearchStrategy[Any]] = {
+    "n_entropy_actions": st.integers(2, 3),
+    "n_entropy_states": st.integers(1, 3),
+}
 own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
     PolicyFlow: {
+        **ode,
         "brownian_coef": coefficients,
         "uniform_noise_coef": coefficients,
         "path": st.sampled_from(["rectified", "stochastic", "stochastic_exact", "trigflow"]),
@@ -116,6 +122,7 @@ own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
         "log_ratio_clamp": st.sampled_from([None, 1.0]),
     },
     FPO: {
+        **ode,
         "n_probes": st.integers(1, 3),
         "probe_average": st.sampled_from(["loss", "objective"]),
         "loss_target": st.sampled_from(["epsilon", "velocity"]),
@@ -124,8 +131,24 @@ own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
         "loss_clamp": st.sampled_from([None, 1.0]),
         "difference_clamp": st.sampled_from([None, 1.0]),
         "action_noise_std": st.sampled_from([0.0, 0.1]),
-        "n_entropy_actions": st.integers(2, 3),
-        "n_entropy_states": st.integers(1, 3),
+        **entropy,
+    },
+    DPPO: {
+        "process": st.sampled_from(["ddpm", "flow"]),
+        "n_denoising_steps": st.integers(2, 4),
+        "n_finetuned_steps": st.sampled_from([None, 1, 2]),
+        "min_sampling_std": st.sampled_from([1e-3, 0.1, 1.0]),
+        "min_log_prob_std": st.sampled_from([1e-2, 0.1]),
+        "noise_clip": st.sampled_from([None, 1.0]),
+        "denoised_clip": st.sampled_from([0.5, 1.0]),
+        "identity_skip": st.booleans(),
+        "log_prob_clamp": st.sampled_from([None, (-5.0, 2.0)]),
+        "log_prob_reduction": st.sampled_from(["mean", "sum"]),
+        "denoising_gamma": st.sampled_from([0.9, 1.0]),
+        "clip_range_base": st.sampled_from([None, 0.01]),
+        "clip_range_rate": st.sampled_from([0.5, 3.0]),
+        "n_critic_warmup": st.integers(0, 2),
+        **entropy,
     },
 }
 refused: dict[str, list[Any]] = {
@@ -142,18 +165,31 @@ refused: dict[str, list[Any]] = {
     "lr_adaptation": ["step"],
     "lr_bounds": [(1e-2, 1e-6)],
     "lr_factor": [1.0],
-    "solver": ["dopri5"],
-    "n_flow_steps": [0, -1],
-    "time_sampler": ["beta"],
     "use_sde": [True],
 }
 """Values that cannot work: one of them spoils a draw now and then."""
+refused_of_ode = {"solver": ["dopri5"], "n_flow_steps": [0, -1], "time_sampler": ["beta"]}
+refused_of: dict[type[Any], dict[str, list[Any]]] = {
+    PolicyFlow: refused_of_ode,
+    FPO: refused_of_ode,
+    DPPO: {
+        "process": ["vp"],
+        "n_denoising_steps": [0],
+        "n_finetuned_steps": [0, 9],
+        "min_sampling_std": [0.0],
+        "log_prob_clamp": [(2.0, -5.0)],
+        "log_prob_reduction": ["max"],
+        "denoising_gamma": [0.0, 1.5],
+        "clip_range_base": [0.0],
+        "n_critic_warmup": [-1],
+    },
+}
 
 
 @st.composite
 def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
     """An algorithm, its arguments, and those of its environment."""
-    algorithm = draw(st.sampled_from([PolicyFlow, FPO]))
+    algorithm = draw(st.sampled_from([PolicyFlow, FPO, DPPO]))
     n_steps, n_envs = draw(st.integers(2, 5)), draw(st.integers(1, 3))
     options = draw(st.fixed_dictionaries({}, optional={**common, **own[algorithm]}))
     if "gaussian" in options or "stochastic" in options.get("path", ""):
@@ -170,8 +206,9 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
     }
     spoiler = draw(st.sampled_from([None] * 6 + ["option", "actions"]))
     if spoiler == "option":
-        name = draw(st.sampled_from(sorted(refused)))
-        options[name] = draw(st.sampled_from(refused[name]))
+        wrong = {**refused, **refused_of[algorithm]}
+        name = draw(st.sampled_from(sorted(wrong)))
+        options[name] = draw(st.sampled_from(wrong[name]))
     if spoiler == "actions":
         environment["action_space"] = draw(unbounded_boxes | st.just(spaces.Discrete(3)))
     return algorithm, options, environment

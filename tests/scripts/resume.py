@@ -16,13 +16,18 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
 from sb3_policyflow.common.saving import RandomStates
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
-from sb3_policyflow.fpo import FPO
-from sb3_policyflow.policyflow import PolicyFlow
 
-ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO}
+ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "PolicyFlow": {"brownian_coef": "lin_0.25"},
+    "FPO": {},
+    # The critic's warm-up ends, and a part of the chain is frozen, on either side of the file.
+    "DPPO": {"n_critic_warmup": 3, "n_denoising_steps": 4, "n_finetuned_steps": 2},
+}
 N_ENVS, N_STEPS, ITERATIONS = 8, 32, 4
 TOTAL = N_ENVS * N_STEPS * ITERATIONS
 HALF = TOTAL // 2
@@ -58,7 +63,6 @@ class EnvStateCheckpoint(RolloutCheckpointCallback):
 
 def whole(folder: Path, algorithm: type[Any]) -> Any:
     env = VecNormalize(VecMonitor(MultiGoalVecEnv(N_ENVS, seed=3)), gamma=0.9)
-    options = {"brownian_coef": "lin_0.25"} if algorithm is PolicyFlow else {}
     model = algorithm(
         "MlpPolicy",
         env,
@@ -70,7 +74,7 @@ def whole(folder: Path, algorithm: type[Any]) -> Any:
         desired_kl=1e-4,
         seed=5,
         policy_kwargs={"net_arch": [16, 16], "embedding_dim": 8},
-        **options,
+        **OPTIONS[algorithm.__name__],
     )
     checkpoint = EnvStateCheckpoint(
         HALF // N_ENVS, str(folder), name_prefix="model", save_vecnormalize=True

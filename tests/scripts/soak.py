@@ -2,8 +2,8 @@
 
 python tests/scripts/soak.py [MINUTES] [FOLDER]
 
-Prints a line every tenth of the time, and in the end how memory grew per million steps (a straight
-line through the second half), how many file handles there are, and the speed of both halves.
+Prints a line every tenth of the time, and in the end how memory grew (a straight line through the
+second half), how many file handles there are, and the speed of both halves.
 """
 
 import os
@@ -77,15 +77,24 @@ def speed(samples: list[Sample]) -> float:
     return (last.timesteps - first.timesteps) / (last.seconds - first.seconds)
 
 
+def slope(samples: list[Sample], unit: str, size: float) -> float:
+    """Growth of memory in MiB for each ``size`` of a unit of time, by a straight line."""
+    memory = [sample.memory / 2**20 for sample in samples]
+    times = [getattr(sample, unit) / size for sample in samples]
+    return float(np.polyfit(times, memory, 1)[0])
+
+
 def summary(samples: list[Sample]) -> str:
     """Growth of memory, handles, and the speed of both halves."""
     half = len(samples) // 2
-    late = np.array(samples[half:], dtype=np.float64)
-    slope = np.polyfit(late[:, 1] / 1e6, late[:, 2] / 2**20, 1)[0]
+    early, late = samples[:half], samples[half:]
     return (
-        f"{samples[-1].timesteps} steps: memory {slope:+.3f} MiB per million steps, handles "
-        f"{samples[half].handles} to {samples[-1].handles}, {speed(samples[:half]):.0f} and then "
-        f"{speed(samples[half:]):.0f} steps/s"
+        f"{samples[-1].timesteps} steps in {samples[-1].seconds / 60:.0f} minutes: memory "
+        f"{samples[0].memory / 2**20:.1f} MiB at the start, {late[0].memory / 2**20:.1f} half-way "
+        f"and {late[-1].memory / 2**20:.1f} at the end, slope of the second half "
+        f"{slope(late, 'seconds', 3600):+.2f} MiB/h, {slope(late, 'timesteps', 1e6):+.3f} MiB per "
+        f"million steps; handles {late[0].handles} to {late[-1].handles}; {speed(early):.0f} and "
+        f"then {speed(late):.0f} steps/s"
     )
 
 

@@ -1,0 +1,1 @@
+"""IsaacLab 2, as far as a training script sees it."""
