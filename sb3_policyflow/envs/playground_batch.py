@@ -74,7 +74,7 @@ class PlaygroundBatch:
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps or int(config.episode_length)
         self.bounds = self._action_bounds(task)
-        self._on_cpu = jax.default_backend() == "cpu"
+        self._device = jax.devices()[0]
         self._action_repeat = int(config.action_repeat)
         self._steps: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
         self._reset = jax.jit(self._start)
@@ -83,7 +83,7 @@ class PlaygroundBatch:
 
     def reset(self, seed: int) -> None:
         """Start all environments anew, each from an initial state of its own."""
-        self.state = self._reset(np.uint32(seed))
+        self.state = self._draw_states(seed)
         self._steps[:] = 0
 
     def step(self, actions: Tree) -> None:
@@ -91,7 +91,7 @@ class PlaygroundBatch:
 
         :param actions: float32, shape ``(num_envs, action_dim)``
         """
-        self.state = self._step(self.state, actions)
+        self.state = self._step(self.state, jax.device_put(actions, self._device))
         self._steps += self._action_repeat
 
     def renew(self, which: NDArray[np.bool_], seed: int) -> None:
@@ -103,7 +103,7 @@ class PlaygroundBatch:
         :param which: which environments, shape ``(num_envs,)``
         :param seed: of the initial states
         """
-        self.state = self._select(which, self._reset(np.uint32(seed)), self.state)
+        self.state = self._select(which, self._draw_states(seed), self.state)
         self._steps[which] = 0
 
     @property
@@ -134,15 +134,14 @@ class PlaygroundBatch:
         They share memory if torch can use the device that JAX has them on; if it cannot, they are
         copied to the CPU.
         """
-        if self._on_cpu or th.cuda.is_available():
+        if self._device.platform == "cpu" or th.cuda.is_available():
             return jax.tree.map(from_dlpack, arrays)
         return jax.tree.map(lambda array: th.from_numpy(np.array(array)), arrays)
 
     def from_torch(self, actions: th.Tensor) -> Tree:
-        """Actions on JAX's device; they share memory if they are there already."""
+        """Actions as an array, which shares their memory if JAX can use their device."""
         actions = actions.detach().contiguous().float()
-        array = jax.dlpack.from_dlpack(actions.cpu() if self._on_cpu else actions)
-        return jax.device_put(array, jax.devices()[0])
+        return jax.dlpack.from_dlpack(actions.cpu() if self._device.platform == "cpu" else actions)
 
     def _action_bounds(self, task: str) -> NDArray[np.float64]:
         """Lower and upper bounds, shape ``(action_dim, 2)``.
@@ -153,6 +152,10 @@ class PlaygroundBatch:
         if task in dm_control_suite.ALL_ENVS:
             return np.array(self.env.mj_model.actuator_ctrlrange)
         return np.tile([-1.0, 1.0], (self.env.action_size, 1))
+
+    def _draw_states(self, seed: int) -> Tree:
+        # What is put on a device stays on it: JAX compiles anew if some arrays are and some are not.
+        return self._reset(jax.device_put(np.uint32(seed), self._device))
 
     def _start(self, seed: Tree) -> Tree:
         keys = jax.random.split(jax.random.PRNGKey(seed), self.num_envs)
