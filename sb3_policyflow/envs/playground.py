@@ -33,13 +33,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_policyflow.envs import PLAYGROUND, import_extra
-from sb3_policyflow.envs.playground_camera import Camera
 from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
 
 if TYPE_CHECKING:
     from sb3_policyflow.envs.playground_batch import Overrides, PlaygroundBatch
+    from sb3_policyflow.envs.playground_camera import Camera
 
-METADATA: Info = {"render_modes": ["rgb_array"], "render_fps": 50}
+METADATA: Info = {"render_modes": ["rgb_array"]}
 OLDEST_VERSION = (0, 2)
 
 FloatArray = NDArray[np.float32]
@@ -110,6 +110,7 @@ class PlaygroundEnv(gym.Env[Any, FloatArray]):
         config_overrides: Overrides | None = None,
     ) -> None:
         self.batch = _load(task, 1, max_episode_steps, config_overrides)
+        self.metadata = {**METADATA, "render_fps": round(1 / self.batch.env.dt)}
         self.observation_space = self.batch.observation_space()
         self.action_space = self.batch.action_space()
         self.render_mode = render_mode
@@ -179,10 +180,14 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
         max_episode_steps: int | None = None,
         config_overrides: Overrides | None = None,
     ) -> None:
-        self.metadata = {**METADATA, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.batch = _load(task, num_envs, max_episode_steps, config_overrides)
+        self.metadata = {
+            **METADATA,
+            "render_fps": round(1 / self.batch.env.dt),
+            "autoreset_mode": AutoresetMode.SAME_STEP,
+        }
         self.single_observation_space = self.batch.observation_space()
         self.single_action_space = self.batch.action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -300,4 +305,8 @@ def _refuse(options: Info | None) -> None:
 
 
 def _camera(batch: PlaygroundBatch, render_mode: str | None) -> Camera | None:
-    return None if render_mode is None else Camera(batch.env.mj_model)
+    if render_mode is None:
+        return None
+    from sb3_policyflow.envs.playground_camera import Camera
+
+    return Camera(batch.env.mj_model)

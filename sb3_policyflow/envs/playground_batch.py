@@ -154,7 +154,7 @@ class PlaygroundBatch:
         return np.tile([-1.0, 1.0], (self.env.action_size, 1))
 
     def _draw_states(self, seed: int) -> Tree:
-        # What is put on a device stays on it: JAX compiles anew if some arrays are and some are not.
+        # JAX compiles anew if some arrays are bound to a device that were not, or the other way.
         return self._reset(jax.device_put(np.uint32(seed), self._device))
 
     def _start(self, seed: Tree) -> Tree:
