@@ -60,8 +60,7 @@ def time_environment(env_id: str, num_envs: int, seconds: float) -> Timing:
     """
     ensure_registered(env_id)
     env = make_vec_env(env_id, num_envs, seed=0, vec_env_cls=make_native_vec_env)  # type: ignore[arg-type]
-    size = (num_envs, *env.action_space.shape)  # type: ignore[misc]  # it is a Box
-    actions = np.random.default_rng(0).uniform(-1, 1, size).astype(np.float32)
+    actions = np.stack([env.action_space.sample() for _ in range(num_envs)])
     first_seconds = _seconds(env.reset) + _seconds(lambda: env.step(actions))
     reset_seconds = _seconds(env.reset)
     cpu_start = time.process_time()

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.metadata
+import re
 import subprocess
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -64,7 +65,7 @@ def require_task(task: str) -> None:
 def _require_playground(env_id: str) -> None:
     import_extra("mujoco_playground", "playground", env_id)
     version = importlib.metadata.version("playground")
-    if tuple(int(part) for part in version.split(".")[:2]) < OLDEST_VERSION:
+    if tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST_VERSION:
         oldest = ".".join(map(str, OLDEST_VERSION))
         raise DependencyNotInstalled(
             f"{env_id} needs playground {oldest} or newer, and {version} is installed: "
@@ -144,8 +145,9 @@ class TensorStep(NamedTuple):
     """What ``PlaygroundVectorEnv.step_tensors`` returns, for n environments.
 
     Observations (n, ...), where an episode has ended those of the next one; rewards (n,); whether
-    the task has ended, and whether the time has (n,); and the observations before any reset, of
-    which those of ended episodes are their last. Observations are dictionaries if the space is.
+    the task has ended, and whether the time has (n,), both on the CPU; and the observations before
+    any reset, of which those of ended episodes are their last. Observations are dictionaries if the
+    space is.
     """
 
     observations: Any
@@ -215,11 +217,15 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     def step_tensors(self, actions: th.Tensor) -> TensorStep:
         """``step``, with tensors. Do not write to them."""
         final, rewards, *flags = self._advance(self.batch.from_torch(actions))
+        to_torch = self.batch.to_torch
         terminated, truncated = (th.from_numpy(flag) for flag in flags)
-        observations, rewards, final = map(
-            self.batch.to_torch, (self.batch.state.obs, rewards, final)
+        return TensorStep(
+            to_torch(self.batch.state.obs),
+            to_torch(rewards),
+            terminated,
+            truncated,
+            to_torch(final),
         )
-        return TensorStep(observations, rewards, terminated, truncated, final)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         if self._camera is None:

@@ -61,19 +61,23 @@ class PlaygroundBatch:
     :param num_envs: number of environments
     :param max_episode_steps: time limit; None for the task's ``episode_length``
     :param overrides: changes to the task's configuration
+    :raises ValueError: if a number is less than 1, or an override is not known
     """
-
-    state: Tree
-    """Playground's own state; ``obs`` and ``reward`` are those of the last step."""
 
     def __init__(
         self, task: str, num_envs: int, max_episode_steps: int | None, overrides: Overrides
     ) -> None:
         config = task_config(task, overrides)
+        limit = config.episode_length if max_episode_steps is None else max_episode_steps
+        if num_envs < 1 or limit < 1:
+            raise ValueError(
+                f"num_envs and max_episode_steps must be at least 1, not {num_envs} and {limit}."
+            )
         self.env = registry.load(task, config=config)
         self.num_envs = num_envs
-        self.max_episode_steps = max_episode_steps or int(config.episode_length)
+        self.max_episode_steps = int(limit)
         self.bounds = self._action_bounds(task)
+        self._state: Tree = None
         self._device = jax.devices()[0]
         self._action_repeat = int(config.action_repeat)
         self._steps: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
@@ -81,9 +85,19 @@ class PlaygroundBatch:
         self._step = jax.jit(self._advance)
         self._select = jax.jit(self._replace)
 
+    @property
+    def state(self) -> Tree:
+        """Playground's own state; ``obs`` and ``reward`` are those of the last step.
+
+        :raises ResetNeeded: before the first ``reset``
+        """
+        if self._state is None:
+            raise gym.error.ResetNeeded("Call reset before the first step.")
+        return self._state
+
     def reset(self, seed: int) -> None:
         """Start all environments anew, each from an initial state of its own."""
-        self.state = self._draw_states(seed)
+        self._state = self._draw_states(seed)
         self._steps[:] = 0
 
     def step(self, actions: Tree) -> None:
@@ -91,7 +105,7 @@ class PlaygroundBatch:
 
         :param actions: float32, shape ``(num_envs, action_dim)``
         """
-        self.state = self._step(self.state, jax.device_put(actions, self._device))
+        self._state = self._step(self.state, jax.device_put(actions, self._device))
         self._steps += self._action_repeat
 
     def renew(self, which: NDArray[np.bool_], seed: int) -> None:
@@ -103,7 +117,7 @@ class PlaygroundBatch:
         :param which: which environments, shape ``(num_envs,)``
         :param seed: of the initial states
         """
-        self.state = self._select(which, self._draw_states(seed), self.state)
+        self._state = self._select(which, self._draw_states(seed), self.state)
         self._steps[which] = 0
 
     @property

@@ -23,6 +23,7 @@ pytest.importorskip("mujoco_playground", reason="playground is not installed")
 import jax
 from mujoco_playground import dm_control_suite, registry
 from mujoco_playground._src.dm_control_suite import cartpole
+from mujoco_playground._src.mjx_env import MENAGERIE_PATH
 
 N_ENVS, LIMIT = 4, 5
 CARTPOLE = "CartpoleBalance"
@@ -250,6 +251,18 @@ def test_bad_input_is_refused(cartpoles):
         PlaygroundVecEnv("CheetaRun", 2)
     with pytest.raises(gym.error.NameNotFound, match="nearest: CheetahRun"):
         ensure_registered("Playground/CheetahRun-v9")
+
+    with pytest.raises(ValueError, match="must be at least 1, not 2 and 0"):
+        PlaygroundVecEnv(CARTPOLE, 2, max_episode_steps=0)
+    with pytest.raises(gym.error.ResetNeeded, match="Call reset"):
+        PlaygroundVectorEnv(CARTPOLE, 2).step(np.zeros((2, 1)))
+
+
+@pytest.mark.skipif(MENAGERIE_PATH.exists(), reason="mujoco_menagerie is there")
+def test_robots_that_cannot_be_fetched_are_named_in_one_sentence(monkeypatch):
+    monkeypatch.setenv("PATH", "")  # so that there is no git
+    with pytest.raises(gym.error.DependencyNotInstalled, match="needs the robots of mujoco_menag"):
+        PlaygroundEnv("Go1JoystickFlatTerrain")
 
 
 def test_an_old_version_is_named_in_one_sentence(monkeypatch):
