@@ -96,19 +96,27 @@ def _steps_in(env: VecEnv, actions: np.ndarray, seconds: float) -> tuple[int, fl
 
 
 def speed_table(timings: Sequence[Timing]) -> str:
-    """A row for each environment, a column for each size, and the times of the largest."""
+    """A row for each environment, a column for each size, and the times of the largest.
+
+    Steps per second of time, and in brackets per second of processor time, which says more where
+    the machine had something else to do.
+    """
     sizes = sorted({timing.num_envs for timing in timings})
     largest = f"{sizes[-1]} environments"
     header = ["steps per second", *map(str, sizes), f"first step, s, {largest}", "reset, ms"]
     rows = []
     for env_id in dict.fromkeys(timing.env_id for timing in timings):
         found = {timing.num_envs: timing for timing in timings if timing.env_id == env_id}
-        rates = [f"{found[n].steps_per_second:,.0f}" if n in found else "-" for n in sizes]
+        rates = [_rates(found[n]) if n in found else "-" for n in sizes]
         last = found[max(found)]
         rows.append(
             [env_id, *rates, f"{last.first_seconds:.0f}", f"{1000 * last.reset_seconds:,.0f}"]
         )
     return markdown_table(header, rows)
+
+
+def _rates(timing: Timing) -> str:
+    return f"{timing.steps_per_second:,.0f} ({timing.steps_per_cpu_second:,.0f})"
 
 
 def main(argv: list[str]) -> int:

@@ -30,7 +30,8 @@ def test_each_environment_and_size_is_timed(
         cells = row.strip("| ").split(" | ")
         assert cells[0] == row_id
         found = [t for t in timings if t["env_id"] == row_id]
-        assert cells[1:3] == [f"{t['steps_per_second']:,.0f}" for t in found]
+        rates = [(t["steps_per_second"], t["steps_per_cpu_second"]) for t in found]
+        assert cells[1:3] == [f"{wall:,.0f} ({cpu:,.0f})" for wall, cpu in rates]
 
 
 def test_steps_are_those_of_all_environments() -> None:
