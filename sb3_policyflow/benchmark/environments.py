@@ -13,17 +13,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.error import Error
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_policyflow.benchmark.results import ResultsError
 from sb3_policyflow.benchmark.speed import machine
 from sb3_policyflow.benchmark.table import markdown_table
 from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS, ensure_registered
-from sb3_policyflow.zoo.vector import make_native_vec_env
+from sb3_policyflow.zoo.vector import has_own_vectorisation, make_native_vec_env
 
 DEFAULT_IDS = tuple(f"{PLAYGROUND}{task}-v0" for task in PLAYGROUND_TASKS)
 DEFAULT_SIZES = (64, 256, 1024)
@@ -59,7 +61,9 @@ def time_environment(env_id: str, num_envs: int, seconds: float) -> Timing:
     :raises gymnasium.error.Error: if it cannot be made
     """
     ensure_registered(env_id)
-    env = make_vec_env(env_id, num_envs, seed=0, vec_env_cls=make_native_vec_env)  # type: ignore[arg-type]
+    is_native = has_own_vectorisation(gym.spec(env_id))
+    vec_env_cls: Any = make_native_vec_env if is_native else DummyVecEnv
+    env = make_vec_env(env_id, num_envs, seed=0, vec_env_cls=vec_env_cls)
     actions = np.stack([env.action_space.sample() for _ in range(num_envs)])
     first_seconds = _seconds(env.reset) + _seconds(lambda: env.step(actions))
     reset_seconds = _seconds(env.reset)
