@@ -7,13 +7,19 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	--constraint .ci/constraints.txt
 
-.PHONY: demo test lint types docs clean
+PLAYGROUND_TESTS := tests/envs/test_playground.py tests/zoo/test_playground_commands.py
+
+.PHONY: demo test test-playground lint types docs clean
 
 demo: $(VENV)/demo-installed
 	$(BIN)/python -m sb3_policyflow.benchmark demo
 
 test: $(VENV)/tests-installed
 	$(BIN)/python -m pytest --numprocesses 2 $(PYTEST_ARGS)
+
+# MuJoCo Playground brings 1.5 GB of simulators, and each of its tasks takes long to compile.
+test-playground: $(VENV)/playground-installed
+	$(BIN)/python -m pytest $(PLAYGROUND_TESTS) $(PYTEST_ARGS)
 
 lint: $(VENV)/tests-installed
 	$(BIN)/ruff check .
@@ -31,6 +37,7 @@ clean:
 $(VENV)/demo-installed: EXTRAS := plots,zoo
 $(VENV)/tests-installed: EXTRAS := tests
 $(VENV)/docs-installed: EXTRAS := docs
+$(VENV)/playground-installed: EXTRAS := tests,playground
 
 $(VENV)/%-installed: pyproject.toml .ci/constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -14,6 +14,7 @@ SUBCOMMANDS = {
     "multigoal": "the paper's MultiGoal figure",
     "pointmaze": "the paper's exploration maps",
     "speed": "time PolicyFlow and PPO side by side",
+    "environments": "time environments on their own",
     "cell": "one training, as `run` starts it",
 }
 """What each does; the module is of the same name."""
@@ -21,7 +22,7 @@ SUBCOMMANDS = {
 
 def main(argv: list[str]) -> int:
     """Hand the arguments to a subcommand's module."""
-    lines = "\n".join(f"  {name:10} {text}" for name, text in SUBCOMMANDS.items())
+    lines = "\n".join(f"  {name:12} {text}" for name, text in SUBCOMMANDS.items())
     parser = argparse.ArgumentParser(
         prog="python -m sb3_policyflow.benchmark",
         description=f"subcommands:\n{lines}",

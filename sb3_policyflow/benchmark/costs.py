@@ -17,7 +17,17 @@ from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
-PACKAGES = ("gymnasium", "mujoco", "numpy", "rl_zoo3", "stable-baselines3", "torch")
+PACKAGES = (
+    "gymnasium",
+    "jax",
+    "mujoco",
+    "mujoco-mjx",
+    "numpy",
+    "playground",
+    "rl_zoo3",
+    "stable-baselines3",
+    "torch",
+)
 
 
 class GradientSteps:

@@ -5,8 +5,25 @@ import importlib
 import gymnasium as gym
 from gymnasium.error import DependencyNotInstalled
 
-_OWNERS = {"PointMaze": ("gymnasium_robotics", "robotics")}
-"""Beginnings of other packages' environment ids: the module to import, and the extra with it."""
+PLAYGROUND = "Playground/"
+"""What the ids of MuJoCo Playground's tasks begin with."""
+
+PLAYGROUND_TASKS = (
+    "BallInCup",
+    "CartpoleBalance",
+    "CheetahRun",
+    "FingerSpin",
+    "FingerTurnEasy",
+    "FingerTurnHard",
+    "FishSwim",
+    "ReacherEasy",
+    "ReacherHard",
+    "WalkerWalk",
+)
+"""The paper's tasks of MuJoCo Playground. Others are registered on demand."""
+
+_ROBOTICS = ("Adroit", "AntMaze", "Fetch", "Franka", "Hand", "PointMaze")
+"""Beginnings of gymnasium-robotics' environment ids."""
 
 
 def register() -> None:
@@ -27,30 +44,60 @@ def register() -> None:
         entry_point="sb3_policyflow.envs.point_maze:PointMazeMultiGoalEnv",
         max_episode_steps=600,
     )
+    for task in PLAYGROUND_TASKS:
+        _register_playground(task)
 
 
 def ensure_registered(env_id: str) -> None:
-    """Import the package that registers an environment of the paper, if it is not registered yet.
+    """Register an environment that this package knows of, if it is not registered yet.
 
-    Call it before ``gymnasium.make`` where an id comes from a user. Ids that no known package
-    registers are left to ``gymnasium.make``, whose error names the nearest ones.
+    Call it before ``gymnasium.make`` where an id comes from a user: it imports gymnasium-robotics
+    for its ids, and registers any task of MuJoCo Playground as ``Playground/NAME-v0``. Other ids
+    are left to ``gymnasium.make``, whose error names the nearest ones.
 
-    :param env_id: for instance ``PointMaze_Medium_Diverse_GDense-v3``
-    :raises DependencyNotInstalled: if that package is missing
+    :param env_id: for instance ``PointMaze_Medium_Diverse_GDense-v3``, ``Playground/HopperHop-v0``
+    :raises DependencyNotInstalled: if the package that has it is missing or does not work
+    :raises NameNotFound: if MuJoCo Playground has no such task
     """
-    for prefix, (module, extra) in _OWNERS.items():
-        if env_id.startswith(prefix) and env_id not in gym.registry:
-            import_extra(module, extra, env_id)
+    if env_id in gym.registry:
+        return
+    if env_id.startswith(PLAYGROUND):
+        task = env_id.removeprefix(PLAYGROUND).removesuffix("-v0")
+        importlib.import_module("sb3_policyflow.envs.playground").require_task(task)
+        _register_playground(task)
+    elif env_id.startswith(_ROBOTICS):
+        import_extra("gymnasium_robotics", "robotics", env_id)
+
+
+def _register_playground(task: str) -> None:
+    gym.register(
+        f"{PLAYGROUND}{task}-v0",
+        entry_point="sb3_policyflow.envs.playground:PlaygroundEnv",
+        vector_entry_point="sb3_policyflow.envs.playground:PlaygroundVectorEnv",
+        kwargs={"task": task},
+    )
 
 
 def import_extra(module: str, extra: str, env_id: str) -> None:
     """Import a module that only an extra of this package brings.
 
-    :raises DependencyNotInstalled: if it is missing, with the command that installs it
+    :raises DependencyNotInstalled: if it is missing, or does not go with what else is installed;
+        with the command that installs it
     """
+    command = f"pip install 'sb3-policyflow[{extra}]'"
     try:
         importlib.import_module(module)
-    except ImportError as error:
-        raise DependencyNotInstalled(
-            f"{env_id} needs {module}: pip install 'sb3-policyflow[{extra}]'"
-        ) from error
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise _broken(module, env_id, command, error) from error
+        raise DependencyNotInstalled(f"{env_id} needs {module}: {command}") from error
+    # What a package does when its dependencies' versions do not suit it is its own choice.
+    except Exception as error:
+        raise _broken(module, env_id, command, error) from error
+
+
+def _broken(module: str, env_id: str, command: str, error: Exception) -> DependencyNotInstalled:
+    return DependencyNotInstalled(
+        f"{env_id} needs {module}, which does not go with the packages installed here "
+        f"({type(error).__name__}: {error}): {command} --upgrade"
+    )

@@ -3,17 +3,20 @@
 They run when the module has been executed (see ``sb3_policyflow_startup``), and may run again.
 """
 
+import argparse
 import functools
-import importlib
 import inspect
+import sys
 import warnings
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.zoo.experiment import extend_experiment
 from sb3_policyflow.zoo.samplers import (
     convert_flow_params,
@@ -58,17 +61,22 @@ def _add_algorithms(utils: ModuleType) -> None:
     """Let ``--algo`` and ``--env`` know the algorithms and environments."""
     for name, registration in ALGORITHMS.items():
         utils.ALGOS.setdefault(name, registration.algorithm)
-    _import_robotics()
+    _register_environment_of(sys.argv[1:])
 
 
-def _import_robotics() -> None:
-    """Register gymnasium_robotics' environments, as rl_zoo3 does with the packages it knows of."""
+def _register_environment_of(arguments: list[str]) -> None:
+    """Register what a command's ``--env`` names.
+
+    The commands look it up as soon as they have parsed it, and to register all there is would mean
+    to import all the packages that have environments.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--env", nargs="?")
+    env_id = parser.parse_known_args(arguments)[0].env
     try:
-        importlib.import_module("gymnasium_robotics")
-    except ModuleNotFoundError as error:
-        if error.name == "gymnasium_robotics":
-            return
-        warnings.warn(f"gymnasium_robotics' environments are missing: {error}", stacklevel=2)
+        ensure_registered(env_id or "")
+    except gym.error.Error as error:
+        warnings.warn(str(error), stacklevel=2)
 
 
 def _add_search_spaces(hyperparams_opt: ModuleType) -> None:
@@ -79,7 +87,10 @@ def _add_search_spaces(hyperparams_opt: ModuleType) -> None:
 
 
 def _extend_experiments(exp_manager: ModuleType) -> None:
-    """Let each new ``ExperimentManager`` go through :func:`extend_experiment`."""
+    """Let each new ``ExperimentManager`` go through :func:`extend_experiment`.
+
+    Its environment is registered before, for scripts that have no command line.
+    """
     manager_class = exp_manager.ExperimentManager
     construct = manager_class.__init__
     if hasattr(construct, "extended_by_sb3_policyflow"):
@@ -88,8 +99,9 @@ def _extend_experiments(exp_manager: ModuleType) -> None:
 
     @functools.wraps(construct)
     def construct_and_extend(self: Any, *args: Any, **kwargs: Any) -> None:
+        given = signature.bind_partial(self, *args, **kwargs).arguments
+        ensure_registered(given.get("env_id", ""))
         construct(self, *args, **kwargs)
-        given = signature.bind(self, *args, **kwargs).arguments
         extend_experiment(self, own_algorithms=ALGORITHMS, config_given=bool(given.get("config")))
 
     extended: Any = construct_and_extend

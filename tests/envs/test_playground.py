@@ -1,0 +1,335 @@
+"""MuJoCo Playground's tasks against the engine itself. `make test-playground` runs these."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import sb3_policyflow
+from sb3_policyflow.envs import PLAYGROUND_TASKS, ensure_registered
+from sb3_policyflow.envs.playground import PlaygroundEnv, PlaygroundVecEnv, PlaygroundVectorEnv
+from sb3_policyflow.envs.vector import GymVectorVecEnv
+
+pytest.importorskip("mujoco_playground", reason="playground is not installed")
+
+import jax
+from mujoco_playground import dm_control_suite, registry
+from mujoco_playground._src.dm_control_suite import cartpole
+from mujoco_playground._src.mjx_env import MENAGERIE_PATH
+
+N_ENVS, LIMIT = 4, 5
+CARTPOLE = "CartpoleBalance"
+
+
+def engine(task):
+    return registry.load(task, config_overrides={"impl": "jax"})
+
+
+def row(tree, index):
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def draw_actions(env, n_steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (n_steps, *env.action_space.shape))
+
+
+@pytest.fixture(scope="module")
+def cartpoles():
+    """One small batch with short episodes for many tests: each compilation takes seconds."""
+    return PlaygroundVectorEnv(CARTPOLE, N_ENVS, max_episode_steps=LIMIT)
+
+
+@pytest.fixture(scope="module")
+def engine_step():
+    return jax.jit(engine(CARTPOLE).step)
+
+
+@pytest.mark.parametrize("task", PLAYGROUND_TASKS)
+def test_steps_as_the_engine_does(task):
+    """From each state that is passed through: small differences of contacts would add up."""
+    env = gym.make_vec(f"Playground/{task}-v0", 2)
+    theirs = engine(task)
+    step = jax.jit(theirs.step)
+    assert env.batch.max_episode_steps == registry.get_default_config(task).episode_length == 1000
+    limits = theirs.mj_model.actuator_ctrlrange
+    np.testing.assert_array_equal(env.single_action_space.low, limits[:, 0])
+    np.testing.assert_array_equal(env.single_action_space.high, limits[:, 1])
+    observations, _ = env.reset(seed=3)
+    assert observations.shape == (2, theirs.observation_size)
+    for action in draw_actions(env, 30).astype(np.float32):
+        before = env.batch.state
+        observations, rewards, terminated, truncated, _ = env.step(action)
+        assert not terminated.any()
+        assert not truncated.any()
+        for i in range(2):
+            expected = step(row(before, i), action[i])
+            np.testing.assert_allclose(observations[i], expected.obs, rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(rewards[i], expected.reward, rtol=1e-4, atol=1e-5)
+
+
+def test_the_limit_truncates_and_resets_at_its_step(cartpoles, engine_step):
+    first, _ = cartpoles.reset(seed=0)
+    actions = draw_actions(cartpoles, LIMIT).astype(np.float32)
+    for action in actions[:-1]:
+        _, _, terminated, truncated, infos = cartpoles.step(action)
+        assert not (terminated | truncated).any()
+        assert infos == {}
+    before = cartpoles.batch.state
+    observations, rewards, terminated, truncated, infos = cartpoles.step(actions[-1])
+    assert truncated.all()
+    assert not terminated.any()
+    assert infos["_final_obs"].all()
+    for i in range(N_ENVS):
+        expected = engine_step(row(before, i), actions[-1][i])
+        np.testing.assert_allclose(infos["final_obs"][i], expected.obs, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(rewards[i], expected.reward, rtol=1e-5)
+    # The start of the balancing task: near the middle, upright, and not where it was.
+    assert np.abs(observations[:, 0]).max() < 0.1
+    assert np.abs(observations[:, 2]).max() < np.sin(0.035)
+    assert np.abs(observations - first).max(axis=1).min() > 1e-4
+    assert not cartpoles.step(actions[0])[3].any(), "the clock starts anew"
+
+
+def starts(env, seed, n_episodes):
+    """Observations that episodes start with, shape (n_episodes, num_envs, obs_dim)."""
+    found = [env.reset(seed=seed)[0]]
+    for action in draw_actions(env, LIMIT * (n_episodes - 1)):
+        observations, _, _, truncated, _ = env.step(action)
+        if truncated.any():
+            found.append(observations)
+    return np.array(found)
+
+
+def test_each_episode_starts_in_a_state_of_its_own(cartpoles):
+    found = starts(cartpoles, 0, 6)
+    assert found.shape == (6, N_ENVS, 5)
+    assert len(np.unique(found.reshape(-1, 5), axis=0)) == 6 * N_ENVS
+
+
+def test_a_seed_repeats_and_another_differs(cartpoles):
+    once, again, other = starts(cartpoles, 7, 3), starts(cartpoles, 7, 3), starts(cartpoles, 8, 3)
+    np.testing.assert_array_equal(once, again)
+    assert (once != other).any(axis=-1).all()
+    unseeded = [cartpoles.reset()[0] for _ in range(2)]
+    assert (unseeded[0] != unseeded[1]).any()
+
+
+def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
+    cartpoles.reset(seed=0)
+    actions = draw_actions(cartpoles, 2 + LIMIT).astype(np.float32)
+    cartpoles.step(actions[0])
+    broken = actions[1].copy()
+    broken[2] = np.nan
+    before = cartpoles.batch.state
+    observations, rewards, terminated, truncated, infos = cartpoles.step(broken)
+    np.testing.assert_array_equal(terminated, [False, False, True, False])
+    np.testing.assert_array_equal(infos["_final_obs"], terminated)
+    assert not truncated.any()
+    assert np.isnan(infos["final_obs"][2]).any()
+    assert rewards[2] == 0
+    assert np.isfinite(observations).all()
+    assert np.isfinite(rewards).all()
+    expected = engine_step(row(before, 0), broken[0]).obs
+    np.testing.assert_allclose(observations[0], expected, rtol=1e-5, atol=1e-6)
+    ends = np.array([cartpoles.step(action)[3] for action in actions[2:]])
+    # Two of five steps had been taken; the new episode takes five.
+    assert np.argmax(ends, axis=0).tolist() == [2, 2, 4, 2]
+    assert ends.sum(axis=0).tolist() == [1, 1, 1, 1]
+
+
+def test_sb3_sees_the_ends_of_episodes(cartpoles):
+    cartpoles.reset(seed=0)
+    env = VecMonitor(GymVectorVecEnv(cartpoles))
+    env.reset()
+    actions = draw_actions(cartpoles, LIMIT).astype(np.float32)
+    actions[0, 1] = np.nan
+    steps = [env.step(action) for action in actions]
+    assert steps[0][2].tolist() == [False, True, False, False]
+    assert steps[0][3][1]["TimeLimit.truncated"] is False
+    assert steps[0][3][1]["episode"]["l"] == 1
+    assert steps[-1][2].tolist() == [True, False, True, True]
+    assert steps[-1][3][0]["TimeLimit.truncated"] is True
+    assert steps[-1][3][0]["terminal_observation"].shape == (5,)
+    total = sum(rewards[0] for _, rewards, _, _ in steps)
+    assert steps[-1][3][0]["episode"]["r"] == pytest.approx(total, rel=1e-5)
+    assert steps[-1][3][0]["episode"]["l"] == LIMIT
+
+
+def test_a_step_is_traced_once(monkeypatch):
+    env = PlaygroundVectorEnv("PendulumSwingup", 2, max_episode_steps=3)
+    traced = []
+    original = env.batch.env.step
+    monkeypatch.setattr(env.batch.env, "step", lambda *args: traced.append(1) or original(*args))
+    env.reset(seed=0)
+    env.step(np.zeros((2, 1)))
+    n_traced = len(traced)
+    assert n_traced > 0
+    for action in draw_actions(env, 7):
+        env.step(action)
+    env.reset()
+    env.step(np.zeros((2, 1), np.float64))
+    assert len(traced) == n_traced
+
+
+def test_policyflow_learns_with_normalisation(cartpoles):
+    env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
+    model = sb3_policyflow.PolicyFlow("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2)
+    before = [parameter.clone() for parameter in model.policy.parameters()]
+    model.learn(2 * 16 * N_ENVS)
+    assert model.num_timesteps == 2 * 16 * N_ENVS
+    assert any(
+        (old != new).any() for old, new in zip(before, model.policy.parameters(), strict=True)
+    )
+    assert len(model.ep_info_buffer) == 2 * 16 // LIMIT * N_ENVS
+    assert env.obs_rms.count > 0
+    assert np.isfinite(env.obs_rms.mean).all()
+
+
+def test_tensors_share_memory_and_equal_arrays(cartpoles):
+    actions = draw_actions(cartpoles, 2 * LIMIT).astype(np.float32)
+    first, _ = cartpoles.reset(seed=4)
+    arrays = [cartpoles.step(action) for action in actions]
+    np.testing.assert_array_equal(cartpoles.reset_tensors(seed=4).numpy(), first)
+    for action, (observations, rewards, terminated, truncated, infos) in zip(
+        actions, arrays, strict=True
+    ):
+        step = cartpoles.step_tensors(th.from_numpy(action))
+        np.testing.assert_array_equal(step.observations, observations)
+        np.testing.assert_array_equal(step.rewards, rewards)
+        np.testing.assert_array_equal(step.terminated, terminated)
+        np.testing.assert_array_equal(step.truncated, truncated)
+        final = np.stack(infos["final_obs"]) if truncated.any() else observations
+        np.testing.assert_array_equal(step.final_observations, final)
+        device_array = cartpoles.batch.state.obs
+        assert step.observations.data_ptr() == device_array.unsafe_buffer_pointer()
+
+
+@pytest.mark.filterwarnings("ignore:.*not within the observation space|.*gym.make.*")
+def test_check_env():
+    env = gym.make(f"Playground/{CARTPOLE}-v0", max_episode_steps=20)
+    sb3_check_env(env)
+    gymnasium_check_env(env.unwrapped, skip_render_check=True)
+    first, _ = env.reset(seed=1)
+    again, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(first, again)
+    observation, reward, terminated, truncated, _ = env.step(np.zeros(1))
+    assert observation.shape == (5,)
+    assert type(reward) is float
+    assert (type(terminated), type(truncated)) == (bool, bool)
+
+
+def test_the_task_settings_can_be_changed():
+    env = PlaygroundEnv(CARTPOLE, config_overrides={"action_repeat": 2, "episode_length": 6})
+    plain = PlaygroundEnv(CARTPOLE)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], plain.reset(seed=0)[0])
+    for step in range(3):
+        action = np.array([0.3 * step], np.float32)
+        observation, reward, _, truncated, _ = env.step(action)
+        *_, first_reward, _, _, _ = plain.step(action)
+        expected, second_reward, _, _, _ = plain.step(action)
+        np.testing.assert_allclose(observation, expected, rtol=1e-4, atol=1e-5)
+        assert reward == pytest.approx(first_reward + second_reward, rel=1e-5)
+        assert truncated == (step == 2)
+    with pytest.raises(ValueError, match=r"no setting 'sim_td'.*sim_dt"):
+        PlaygroundEnv(CARTPOLE, config_overrides={"sim_td": 0.1})
+
+
+def test_bad_input_is_refused(cartpoles):
+    with pytest.raises(ValueError, match=r"actions of shape \(4, 1\), not \(4,\)"):
+        cartpoles.step(np.zeros(N_ENVS))
+    with pytest.raises(ValueError, match="takes no options"):
+        cartpoles.reset(options={"position": 1})
+    with pytest.raises(gym.error.NameNotFound, match="no task 'CheetaRun'; nearest: CheetahRun"):
+        PlaygroundVecEnv("CheetaRun", 2)
+    with pytest.raises(gym.error.NameNotFound, match="nearest: CheetahRun"):
+        ensure_registered("Playground/CheetahRun-v9")
+
+    with pytest.raises(ValueError, match="must be at least 1, not 2 and 0"):
+        PlaygroundVecEnv(CARTPOLE, 2, max_episode_steps=0)
+    with pytest.raises(gym.error.ResetNeeded, match="Call reset"):
+        PlaygroundVectorEnv(CARTPOLE, 2).step(np.zeros((2, 1)))
+
+
+@pytest.mark.skipif(MENAGERIE_PATH.exists(), reason="mujoco_menagerie is there")
+def test_robots_that_cannot_be_fetched_are_named_in_one_sentence(monkeypatch):
+    monkeypatch.setenv("PATH", "")  # so that there is no git
+    with pytest.raises(gym.error.DependencyNotInstalled, match="needs the robots of mujoco_menag"):
+        PlaygroundEnv("Go1JoystickFlatTerrain")
+
+
+def test_an_old_version_is_named_in_one_sentence(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.0.5")
+    with pytest.raises(
+        gym.error.DependencyNotInstalled, match=r"playground 0\.2 or newer.*0\.0\.5"
+    ):
+        PlaygroundEnv(CARTPOLE)
+
+
+def test_any_other_task_is_registered_on_request():
+    env_id = "Playground/PendulumSwingup-v0"
+    ensure_registered(env_id)
+    ensure_registered(env_id)
+    assert gym.make(env_id).observation_space.shape == (3,)
+
+
+class TwoSenses(cartpole.Balance):
+    """A task as a user may add it: what it observes is a dictionary."""
+
+    def _get_obs(self, data, info):
+        everything = super()._get_obs(data, info)
+        return {"state": everything[:3], "velocity": everything[3:]}
+
+
+def test_a_task_of_the_users_own_with_several_observations():
+    def make(**kwargs):
+        return TwoSenses(swing_up=False, sparse=False, **kwargs)
+
+    dm_control_suite.register_environment("TwoSenses", make, cartpole.default_config)
+    env = PlaygroundVecEnv("TwoSenses", 2, seed=0, max_episode_steps=3)
+    assert set(env.observation_space.spaces) == {"state", "velocity"}
+    first = env.reset()
+    assert (first["state"].shape, first["velocity"].shape) == ((2, 3), (2, 2))
+    *_, infos = [env.step(np.zeros((2, 1))) for _ in range(3)][-1]
+    assert infos[1]["terminal_observation"]["state"].shape == (3,)
+    model = sb3_policyflow.PolicyFlow("MultiInputPolicy", env, n_steps=4, batch_size=8, n_epochs=1)
+    assert model.learn(16).num_timesteps == 16
+
+
+DRAW = """
+import gymnasium as gym, numpy as np, sb3_policyflow
+env = gym.make("Playground/CartpoleBalance-v0", render_mode="rgb_array")
+env.reset(seed=0)
+first = env.render()
+for _ in range(30):
+    env.step(np.ones(1, np.float32))
+frame = env.render()
+assert frame.shape == (240, 320, 3) and frame.dtype == np.uint8 and frame.std() > 5
+assert (frame != first).mean() > 0.001
+"""
+
+
+@pytest.mark.parametrize("backend", ["egl", "glfw"])
+def test_pictures_or_one_sentence(backend):
+    """Without a display, which glfw needs and egl does not."""
+    variables = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**variables, "MUJOCO_GL": backend},
+    )
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1]
+        assert last.startswith("gymnasium.error.DependencyNotInstalled: MuJoCo cannot draw here")
+        assert "MUJOCO_GL=egl" in last
+        if backend == "egl":
+            pytest.skip(last)

@@ -1,0 +1,59 @@
+"""What registers environments, and what is said where packages are missing or broken."""
+
+import subprocess
+import sys
+
+import pytest
+
+import sb3_policyflow.envs
+
+
+def run(code, **options):
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def test_ids_are_known_without_the_simulator():
+    done = run(
+        "import sys, gymnasium as gym, sb3_policyflow\n"
+        "for task in sb3_policyflow.envs.PLAYGROUND_TASKS:\n"
+        "    assert gym.spec(f'Playground/{task}-v0').vector_entry_point is not None\n"
+        "import sb3_policyflow.envs.playground\n"
+        "assert not {'jax', 'mujoco', 'mujoco_playground'} & set(sys.modules)"
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(sb3_policyflow.envs.PLAYGROUND_TASKS) == 10
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        "gym.make('Playground/CheetahRun-v0')",
+        "gym.make_vec('Playground/CheetahRun-v0', 4)",
+        "ensure_registered('Playground/HopperHop-v0')",
+    ],
+)
+def test_a_missing_extra_is_named_in_one_sentence(make):
+    done = run(
+        "import sys; sys.modules['mujoco_playground'] = None\n"
+        "import gymnasium as gym\n"
+        "from sb3_policyflow.envs import ensure_registered\n" + make
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("gymnasium.error.DependencyNotInstalled: Playground/")
+    assert last.endswith("pip install 'sb3-policyflow[playground]'")
+
+
+@pytest.mark.parametrize("fault", ["import not_there", "import math; math.not_there"])
+def test_a_broken_package_is_told_from_a_missing_one(fault, tmp_path):
+    (tmp_path / "mujoco_playground.py").write_text(fault)
+    done = run(
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import gymnasium as gym, sb3_policyflow\n"
+        "gym.make('Playground/CheetahRun-v0')",
+        cwd=tmp_path,
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert "which does not go with the packages installed here" in last
+    assert "not_there" in last
+    assert last.endswith("pip install 'sb3-policyflow[playground]' --upgrade")
