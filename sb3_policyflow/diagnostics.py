@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.checks import check_at_least
+from sb3_policyflow.common.checks import check_count
 from sb3_policyflow.common.entropy import nearest_neighbour_entropy
 from sb3_policyflow.common.losses import gaussian_kl, shifted_gaussian_log_ratio
 from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
@@ -70,10 +70,10 @@ class FlowDiagnosticsCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        check_at_least("every", every, 1)
-        check_at_least("n_samples", n_samples, 2)
-        check_at_least("n_entropy_states", n_entropy_states, 0)
-        check_at_least("n_entropy_actions", n_entropy_actions, 2)
+        check_count("every", every, 1)
+        check_count("n_samples", n_samples, 2)
+        check_count("n_entropy_states", n_entropy_states, 0)
+        check_count("n_entropy_actions", n_entropy_actions, 2)
         self.every = every
         self.n_samples = n_samples
         self.n_entropy_states = n_entropy_states

@@ -145,8 +145,9 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
             checks.check_between(name, getattr(self, name), 0.0)
         for name in ("gamma", "gae_lambda"):
             checks.check_between(name, getattr(self, name), 0.0, 1.0)
-        checks.check_at_least("n_steps", self.n_steps, 1)
-        checks.check_at_least("n_epochs", self.n_epochs, 1)
+        checks.check_positive_or_none("target_kl", self.target_kl)
+        checks.check_count("n_steps", self.n_steps, 1)
+        checks.check_count("n_epochs", self.n_epochs, 1)
         checks.check_batches(self.batch_size, self.n_steps, self.n_envs, self.normalize_advantage)
         checks.check_choice("lr_adaptation", self.lr_adaptation, ("epoch", "minibatch"))
         checks.check_choice("kl_window", self.kl_window, ("epoch", "update"))
@@ -180,8 +181,24 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
             if self._kl_schedule(1.0) == 0:
                 raise ValueError(f"desired_kl must be positive or None, got {self.desired_kl}.")
             self._lr_rule = KLAdaptiveLearningRate(self.lr_factor, self.kl_margin, self.lr_bounds)
-            if self.adaptive_learning_rate is None:
-                self.adaptive_learning_rate = self.lr_schedule(1.0)
+        self._start_adaptive_learning_rate()
+
+    def _start_adaptive_learning_rate(self) -> None:
+        """Begin with ``learning_rate``, unless a saved run that began with it goes on.
+
+        :raises ValueError: If ``learning_rate`` is a schedule, which nothing would follow.
+        """
+        start = self.lr_schedule(1.0)
+        if self.desired_kl is None:
+            self.adaptive_learning_rate = None
+        elif start != self.lr_schedule(0.0):
+            raise ValueError(
+                "With desired_kl the learning rate follows the divergence of the policy: give the "
+                "learning_rate that it starts with, not a schedule."
+            )
+        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
+            self.adaptive_learning_rate = start
+        self._adaptive_start = start
 
     def _excluded_save_params(self) -> list[str]:
         derived = ["_entropy_schedule", "_kl_schedule", "_lr_rule"]

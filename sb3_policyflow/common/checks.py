@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Collection
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -27,13 +27,13 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
         raise ValueError(f"{name} must be one of {known}, got {value!r}.")
 
 
-def check_at_least(name: str, value: float, lowest: float) -> None:
-    """Refuse a number that is too small (or none at all).
+def check_count(name: str, value: object, lowest: int) -> None:
+    """Refuse what is not a whole number, or too small.
 
     :raises ValueError: With the lowest value that is allowed.
     """
-    if not isinstance(value, (int, float)) or not value >= lowest:
-        raise ValueError(f"{name} must be at least {lowest}, got {value!r}.")
+    if not isinstance(value, Integral) or not int(value) >= lowest:
+        raise ValueError(f"{name} must be at least {lowest}, and a whole number, got {value!r}.")
 
 
 def check_between(name: str, value: object, lowest: float, highest: float = math.inf) -> None:
@@ -45,6 +45,15 @@ def check_between(name: str, value: object, lowest: float, highest: float = math
         return
     if not isinstance(value, Real) or not lowest <= float(value) <= highest:
         raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
+
+
+def check_positive(name: str, value: object) -> None:
+    """Refuse a number that is not positive.
+
+    :raises ValueError: If it is not.
+    """
+    if not isinstance(value, Real) or not float(value) > 0:
+        raise ValueError(f"{name} must be positive, got {value!r}.")
 
 
 def check_positive_or_none(name: str, value: float | None) -> None:
@@ -112,7 +121,7 @@ def check_batches(batch_size: int, n_steps: int, n_envs: int, normalize_advantag
     :raises ValueError: If advantages would be normalised over one sample.
     """
     buffer_size = n_steps * n_envs
-    check_at_least("batch_size", batch_size, 2 if normalize_advantage else 1)
+    check_count("batch_size", batch_size, 2 if normalize_advantage else 1)
     if normalize_advantage and buffer_size < 2:
         raise ValueError(
             "Advantages cannot be normalised over one sample: n_steps * n_envs must be greater "

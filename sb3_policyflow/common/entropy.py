@@ -46,8 +46,8 @@ class SampledEntropyMixin(FlowOnPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        checks.check_at_least("n_entropy_actions", self.n_entropy_actions, 2)
-        checks.check_at_least("n_entropy_states", self.n_entropy_states, 1)
+        checks.check_count("n_entropy_actions", self.n_entropy_actions, 2)
+        checks.check_count("n_entropy_states", self.n_entropy_states, 1)
 
     def _entropy_bonus(self, features: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """What the entropy adds to the loss, and what to log of it.

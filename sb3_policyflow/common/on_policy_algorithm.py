@@ -1,6 +1,7 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 import math
+import sys
 from abc import abstractmethod
 from typing import Any, ClassVar
 
@@ -89,6 +90,8 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             metrics.add(figures)
             divergences.append(kl.detach())
             if self.target_kl is not None and kl.item() > 1.5 * self.target_kl:
+                if self.verbose >= 1:
+                    sys.stdout.write(f"Early stopping due to reaching max kl: {kl.item():.2f}\n")
                 return False
             self._optimise(loss, parameters)
             if self.lr_adaptation == "minibatch":
@@ -168,6 +171,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
                 f"learning rate{self.divergence_advice}."
             )
         self.policy.optimizer.step()
+        self.policy.keep_within_bounds()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_loss"]

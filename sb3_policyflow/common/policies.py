@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
@@ -227,13 +228,23 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         assert self.action_space.shape is not None
         return actions.reshape(-1, *self.action_space.shape)
 
+    def keep_within_bounds(self) -> None:
+        """Put parameters that have bounds back into them, after a step of the optimiser."""
+
+    def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
+        """Refuse: SB3's distributions say how likely actions are."""
+        raise self._no_likelihood()
+
     def evaluate_actions(
         self,
         obs: PyTorchObs,  # noqa: ARG002
         actions: th.Tensor,  # noqa: ARG002
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Refuse: the likelihood of an action under a flow policy has no closed form."""
-        raise TypeError(
+        raise self._no_likelihood()
+
+    def _no_likelihood(self) -> TypeError:
+        return TypeError(
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )

@@ -189,8 +189,8 @@ class DPPO(SampledEntropyMixin):
         super()._check_arguments()
         checks.check_choice("log_prob_reduction", self.log_prob_reduction, ("mean", "sum"))
         checks.check_positive_or_none("clip_range_base", self.clip_range_base)
-        checks.check_positive_or_none("clip_range_rate", self.clip_range_rate)
-        checks.check_at_least("n_critic_warmup", self.n_critic_warmup, 0)
+        checks.check_positive("clip_range_rate", self.clip_range_rate)
+        checks.check_count("n_critic_warmup", self.n_critic_warmup, 0)
         if not 0 < self.denoising_gamma <= 1:
             raise ValueError(f"denoising_gamma must be in (0, 1], got {self.denoising_gamma}.")
         if self.log_prob_clamp is not None and not self.log_prob_clamp[0] < self.log_prob_clamp[1]:

@@ -9,7 +9,12 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import check_at_least, check_choice, check_positive_or_none
+from sb3_policyflow.common.checks import (
+    check_choice,
+    check_count,
+    check_positive,
+    check_positive_or_none,
+)
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
 
@@ -89,12 +94,13 @@ class DPPOPolicy(FlowActorCriticPolicy):
 
     def _check_options(self) -> None:
         check_choice("process", self.process_name, ("ddpm", "flow"))
-        check_at_least("n_denoising_steps", self.n_denoising_steps, 1)
+        check_count("n_denoising_steps", self.n_denoising_steps, 1)
         if self.n_finetuned_steps is not None:
-            check_at_least("n_finetuned_steps", self.n_finetuned_steps, 1)
-            check_at_least("n_denoising_steps", self.n_denoising_steps, self.n_finetuned_steps)
-        for name in ("min_sampling_std", "min_log_prob_std", "noise_clip", "denoised_clip"):
-            check_positive_or_none(name, getattr(self, name))
+            check_count("n_finetuned_steps", self.n_finetuned_steps, 1)
+            check_count("n_denoising_steps", self.n_denoising_steps, self.n_finetuned_steps)
+        for name in ("min_sampling_std", "min_log_prob_std", "denoised_clip"):
+            check_positive(name, getattr(self, name))
+        check_positive_or_none("noise_clip", self.noise_clip)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "process": self.process_name}

@@ -182,7 +182,7 @@ class FPO(SampledEntropyMixin):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        checks.check_at_least("n_probes", self.n_probes, 1)
+        checks.check_count("n_probes", self.n_probes, 1)
         checks.check_choice("probe_average", self.probe_average, ("loss", "objective"))
         checks.check_choice("loss_target", self.loss_target, ("epsilon", "velocity"))
         checks.check_choice("loss_reduction", self.loss_reduction, ("mean", "sum"))

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import check_at_least
+from sb3_policyflow.common.checks import check_between
 from sb3_policyflow.common.ode_policy import OdeFlowPolicy
 from sb3_policyflow.flows import Rectified
 
@@ -41,7 +41,7 @@ class FPOPolicy(OdeFlowPolicy):
         action_noise_std: float = 0.0,
         **kwargs: Any,
     ) -> None:
-        check_at_least("action_noise_std", action_noise_std, 0)
+        check_between("action_noise_std", action_noise_std, 0.0)
         self.action_noise_std = action_noise_std
         super().__init__(
             observation_space,

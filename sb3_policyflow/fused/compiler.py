@@ -24,11 +24,12 @@ def kernels() -> ModuleType | None:
         note_fallback(f"{SWITCH} is 0")
         return None
     try:
-        _forget_outdated()
         from sb3_policyflow.fused import kernels as module
-    except ImportError as error:
-        note_fallback(f"numba cannot be imported ({error})")
+    # Numba raises the second where there is no folder to keep what it compiles.
+    except (ImportError, RuntimeError) as error:
+        note_fallback(f"numba cannot be used ({error})")
         return None
+    _forget_outdated(Path(module.flow.stats.cache_path))
     return module
 
 
@@ -38,14 +39,16 @@ def note_fallback(reason: str) -> None:
     logger.debug("Plain torch does the work of a fused kernel: %s.", reason)
 
 
-def _forget_outdated() -> None:
+def _forget_outdated(cache: Path) -> None:
     """Delete what was compiled before a kernel's source was changed.
 
     Numba looks at one file for each kernel, and kernels consist of parts from several.
+
+    :param cache: Where compiled kernels are kept.
     """
-    folder = Path(__file__).parent / "kernels"
-    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
-    for compiled in folder.glob("__pycache__/*.nb[ci]"):
+    sources = (Path(__file__).parent / "kernels").glob("*.py")
+    newest = max(source.stat().st_mtime for source in sources)
+    for compiled in cache.glob("*.nb[ci]"):
         # Another process may delete it first.
         with suppress(OSError):
             if compiled.stat().st_mtime < newest:

@@ -57,6 +57,8 @@ class FlowPolicy(OdeFlowPolicy):
         gaussian: bool = False,
         **kwargs: Any,
     ) -> None:
+        if log_std_bounds is not None and not log_std_bounds[0] <= log_std_bounds[1]:
+            raise ValueError(f"log_std_bounds must be two numbers in order, got {log_std_bounds}.")
         self.log_std_bounds = log_std_bounds
         self.path_name = path
         self.gaussian = gaussian
@@ -73,6 +75,7 @@ class FlowPolicy(OdeFlowPolicy):
         # SB3 has set both to the defaults of its own actor.
         self.log_std_init = log_std_init
         nn.init.constant_(self.log_std, log_std_init)
+        self.keep_within_bounds()
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "path": self.path_name}
@@ -87,6 +90,11 @@ class FlowPolicy(OdeFlowPolicy):
         if self.log_std_bounds is None:
             return self.log_std
         return self.log_std.clamp(*self.log_std_bounds)
+
+    def keep_within_bounds(self) -> None:
+        # Beyond its bounds it would have no gradient, and never come back.
+        with th.no_grad():
+            self.log_std.copy_(self.noise_log_std)
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
         """Z ~ N(0, I), or 0 where nothing may be drawn, shape (n, action_dim)."""

@@ -188,7 +188,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         checks.check_choice("time_sampler", self.time_sampler, TIME_SAMPLERS)
-        checks.check_at_least("n_times", self.n_times, 1)
+        checks.check_count("n_times", self.n_times, 1)
         checks.check_choice("time_average", self.time_average, ("objective", "shift"))
         checks.check_choice("brownian_reduction", self.brownian_reduction, ("sum", "mean"))
         checks.check_positive_or_none("log_ratio_clamp", self.log_ratio_clamp)
