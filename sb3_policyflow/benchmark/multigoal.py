@@ -96,7 +96,7 @@ def draw(folder: Path, results: Sequence[Result]) -> None:
 
 def main(argv: list[str]) -> int:
     """Train what is missing and make the figure."""
-    arguments = panel_parser("multigoal", __doc__, PANELS, steps=7.4e6).parse_args(argv)
+    arguments = panel_parser("multigoal", __doc__, PANELS, steps=1.4e7).parse_args(argv)
     cells = panel_cells(PANELS, arguments, env=ENV, n_trajectories=N_TRAJECTORIES)
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
     draw(arguments.out, load_results(arguments.out))

@@ -11,6 +11,7 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("gymnasium_robotics")
 
 from sb3_policyflow.benchmark.visits import VisitMap
+from sb3_policyflow.envs.point_maze import ENV_ID
 
 
 def test_command(tmp_path: Path) -> None:
@@ -23,6 +24,13 @@ def test_command(tmp_path: Path) -> None:
     table = (tmp_path / "pointmaze.md").read_text()
     assert "| (b) PPO | 2 |" in table
     assert "| (d) PolicyFlow, Brownian | 2 |" in table
+
+    hyperparams = [
+        json.loads((tmp_path / name / ENV_ID / "seed-0.json").read_text())["hyperparams"]
+        for name in ("b-ppo", "d-brownian")
+    ]
+    assert "brownian_coef" not in hyperparams[0]
+    assert float(hyperparams[1]["brownian_coef"]) > 0
 
     summaries = sorted(tmp_path.glob("*/*/seed-*.json"))
     assert len(summaries) == 4
