@@ -89,9 +89,12 @@ def transposed(matrix: Any) -> Floats:
     """The transposed matrix, laid out row by row."""
     n_rows, n_columns = matrix.shape
     outputs = np.empty((n_columns, n_rows), F)
-    for i in range(n_columns):
-        for j in range(n_rows):
-            outputs[i, j] = matrix[j, i]
+    # Strips of 16 rows: as many lines of the cache, each used 16 times, make one of the outputs.
+    for start in range(0, n_rows, 16):
+        stop = min(start + 16, n_rows)
+        for i in range(n_columns):
+            for j in range(start, stop):
+                outputs[i, j] = matrix[j, i]
     return outputs
 
 
