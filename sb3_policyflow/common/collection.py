@@ -103,16 +103,21 @@ class RolloutVecEnv(VecEnvWrapper):
             self._check_finite(name, values, indices)
 
     def bootstrap_timeouts(
-        self, infos: Infos, predict_values: Callable[[list[int]], th.Tensor], gamma: float
+        self,
+        infos: Infos,
+        dones: np.ndarray,
+        predict_values: Callable[[list[int]], th.Tensor],
+        gamma: float,
     ) -> None:
         """Add the discounted value of what came after each time limit to the step's rewards.
 
         :param infos: The list that :meth:`step_wait` returned, changed in place.
+        :param dones: Whether each episode has ended, shape (n_envs,).
         :param predict_values: Values of the states at the time limits of the environments with
             these indices, shape (n, 1).
         :param gamma: Discount factor.
         """
-        truncated = [index for index, info in enumerate(infos) if _is_timeout(info)]
+        truncated = [i for i in np.flatnonzero(dones).tolist() if _is_timeout(infos[i])]
         if not truncated:
             return
         values = predict_values(truncated).flatten().cpu().numpy()
@@ -229,9 +234,9 @@ class CollectionMixin(OnPolicyAlgorithm):
     def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
         # SB3's loop calls this after the callbacks and before it bootstraps.
         super()._update_info_buffer(infos, dones)
-        if self._collector is not None:
+        if self._collector is not None and dones is not None:
             self._collector.bootstrap_timeouts(
-                infos, lambda indices: self._timeout_values(infos, indices), self.gamma
+                infos, dones, lambda indices: self._timeout_values(infos, indices), self.gamma
             )
 
     def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:

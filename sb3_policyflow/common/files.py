@@ -5,7 +5,7 @@ import uuid
 import warnings
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -55,13 +55,15 @@ def _target(path: Path, suffix: str) -> Path:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a renaming durable, where folders can be opened."""
-    if os.name == "posix":
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
+    """Make a renaming durable, where the file system can do that for folders."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
             os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def check_archive(file: IO[bytes], path: Any, members: tuple[str, ...]) -> None:

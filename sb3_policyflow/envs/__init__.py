@@ -1,6 +1,7 @@
 """Environments of the paper, registered with Gymnasium when the package is imported."""
 
 import importlib
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.error import DependencyNotInstalled
@@ -31,15 +32,13 @@ def register() -> None:
 
     Entry points are strings, so nothing is imported before an environment is made.
     """
-    if "MultiGoal-v0" in gym.registry:
-        return
-    gym.register(
+    _register(
         "MultiGoal-v0",
         entry_point="sb3_policyflow.envs.multigoal:MultiGoalEnv",
         vector_entry_point="sb3_policyflow.envs.multigoal:MultiGoalVectorEnv",
         max_episode_steps=50,
     )
-    gym.register(
+    _register(
         "PointMazeMultiGoal-Medium-v0",
         entry_point="sb3_policyflow.envs.point_maze:PointMazeMultiGoalEnv",
         max_episode_steps=600,
@@ -69,8 +68,14 @@ def ensure_registered(env_id: str) -> None:
         import_extra("gymnasium_robotics", "robotics", env_id)
 
 
+def _register(env_id: str, **options: Any) -> None:
+    """Register an environment, unless there is one of this id."""
+    if env_id not in gym.registry:
+        gym.register(env_id, **options)
+
+
 def _register_playground(task: str) -> None:
-    gym.register(
+    _register(
         f"{PLAYGROUND}{task}-v0",
         entry_point="sb3_policyflow.envs.playground:PlaygroundEnv",
         vector_entry_point="sb3_policyflow.envs.playground:PlaygroundVectorEnv",

@@ -92,9 +92,10 @@ class FlowPolicy(OdeFlowPolicy):
         return self.log_std.clamp(*self.log_std_bounds)
 
     def keep_within_bounds(self) -> None:
-        # Beyond its bounds it would have no gradient, and never come back.
-        with th.no_grad():
-            self.log_std.copy_(self.noise_log_std)
+        if self.log_std_bounds is not None:
+            # Beyond its bounds it would have no gradient, and never come back.
+            with th.no_grad():
+                self.log_std.clamp_(*self.log_std_bounds)
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
         """Z ~ N(0, I), or 0 where nothing may be drawn, shape (n, action_dim)."""

@@ -369,3 +369,41 @@ def test_multigoal_with_the_papers_settings() -> None:
     ).learn(2 * 24_576)
     assert model._n_updates == 10
     assert 0 < np.mean([episode["r"] for episode in model.ep_info_buffer]) < 10  # type: ignore[union-attr]
+
+
+def test_noise_comes_back_from_its_bounds() -> None:
+    """A log standard deviation that has gone beyond would have no gradient there."""
+    model = PolicyFlow(
+        "MlpPolicy",
+        "Pendulum-v1",
+        n_steps=64,
+        seed=0,
+        ent_coef=10.0,
+        policy_kwargs={"log_std_init": -2.0, "log_std_bounds": (-0.7, 0.0)},
+    )
+    log_std = model.policy.log_std
+    assert log_std.item() == pytest.approx(-0.7)
+    model.learn(64)
+    assert -0.7 < log_std.item() < 0.0
+    with th.no_grad():
+        log_std.fill_(-0.001)
+    model.learn(64)
+    assert log_std.item() <= 0.0
+
+
+def test_load_with_another_learning_rate_is_followed(tmp_path: Path) -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=64, seed=0, desired_kl=10.0)
+    model.learn(64).save(tmp_path / "model")
+    adapted = model.adaptive_learning_rate
+    assert adapted is not None
+    assert adapted > 3e-4
+
+    def load(**changed: Any) -> PolicyFlow:
+        return PolicyFlow.load(tmp_path / "model", env=model.get_env(), **changed)
+
+    assert load().adaptive_learning_rate == adapted
+    assert load(desired_kl=5.0).adaptive_learning_rate == adapted
+    assert load(learning_rate=1e-4).adaptive_learning_rate == 1e-4
+    fixed = load(desired_kl=None, learning_rate=1e-4).learn(64)
+    assert fixed.adaptive_learning_rate is None
+    assert fixed.policy.optimizer.param_groups[0]["lr"] == 1e-4
