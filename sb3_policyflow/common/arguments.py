@@ -121,6 +121,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.adaptive_learning_rate: float | None = None
+        self._adaptive_start: float | None = None
         if _init_setup_model:
             self._setup_model()
 
