@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_policyflow import PolicyFlow
 
@@ -40,7 +41,7 @@ def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
         ({"brownian_coef": "linear"}, r"brownian_coef must be a number"),
         ({"brownian_reduction": "max"}, r"brownian_reduction must be one of 'sum', 'mean'"),
         ({"desired_kl": 0.0}, r"desired_kl must be positive or None"),
-        ({"desired_kl": 0.01, "learning_rate": lambda left: 1e-3 * left}, r"not a schedule"),
+        ({"desired_kl": 0.01, "learning_rate": LinearSchedule(1e-3, 0, 1)}, r"not a schedule"),
         ({"target_kl": -1.0}, r"target_kl must be positive"),
         ({"n_epochs": 2.5}, r"n_epochs must be at least 1, and a whole number"),
         ({"policy_kwargs": {"log_std_bounds": (2.0, -5.0)}}, r"log_std_bounds must be two numbers"),
