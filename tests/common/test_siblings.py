@@ -193,7 +193,7 @@ def _plain(annotation: Any) -> str:
         (FPO, {"trust_region": "trpo"}, "trust_region must be one of 'ppo', 'spo', 'aspo'"),
         (FPO, {"loss_clamp": 0.0}, "loss_clamp must be positive, or None"),
         (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, or None"),
-        (FPO, {"action_noise_std": -0.1}, "action_noise_std must be at least 0"),
+        (FPO, {"action_noise_std": -0.1}, "action_noise_std must be a number from 0"),
         (FPO, {"solver": "newton"}, "Unknown solver 'newton'"),
         (FPO, {"n_flow_steps": 0}, "at least one solver step"),
         (FPO, {"ent_coef": -1.0}, "ent_coef must not be negative"),
