@@ -182,7 +182,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         return values
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
-        """Z ~ N(0, I), or 0 for the deterministic action, shape (n, action_dim)."""
+        """Latents z ~ N(0, I), or 0 for the deterministic action, shape (n, action_dim)."""
         draw = th.zeros if deterministic and not self.random_latents else th.randn
         size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
         return draw(size, device=features.device, dtype=features.dtype)

@@ -98,7 +98,7 @@ class FlowPolicy(OdeFlowPolicy):
                 self.log_std.clamp_(*self.log_std_bounds)
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
-        """Z ~ N(0, I), or 0 where nothing may be drawn, shape (n, action_dim)."""
+        """Latents z ~ N(0, I), or 0 where nothing may be drawn, shape (n, action_dim)."""
         if self.gaussian:
             return features.new_zeros(len(features), self.action_dim)
         return super().draw_latents(features, deterministic)
