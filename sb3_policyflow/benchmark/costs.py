@@ -22,6 +22,7 @@ PACKAGES = (
     "jax",
     "mujoco",
     "mujoco-mjx",
+    "numba",
     "numpy",
     "playground",
     "rl_zoo3",
