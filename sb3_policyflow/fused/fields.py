@@ -121,7 +121,12 @@ class FusedVelocityField(VelocityField):
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
-        if parts is None or not parts.serve(points, features) or not _is_data(times):
+        if parts is None:
+            return super().forward(points, times, features)
+        # Parts of tensors, such as the starts of a chain's steps, are worth a copy.
+        points, times, features = points.contiguous(), times.contiguous(), features.contiguous()
+        if not parts.serve(points, features) or not _is_data(times):
+            note_fallback("points, times or features are not float32 on the CPU, or not the field's")
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):

@@ -11,6 +11,8 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.flows import integrate
 from sb3_policyflow.fused.compiler import note_fallback
 from sb3_policyflow.fused.fields import FusedVelocityField
@@ -172,3 +174,15 @@ def test_kernels_are_kept_for_the_next_process_unless_outdated(tmp_path: Path) -
     again = compiled()
     assert again.keys() == first.keys()
     assert min(again.values()) > 0
+
+
+@pytest.mark.parametrize("algorithm", [PolicyFlow, FPO, DPPO])
+def test_nothing_falls_back_in_a_training(
+    algorithm: type[FlowOnPolicyAlgorithm], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not even where an update looks at parts of tensors, as DPPO's does at those of its chains."""
+    note_fallback.cache_clear()
+    model = algorithm("MlpPolicy", "Pendulum-v1", n_steps=32, batch_size=16, n_epochs=1)
+    with caplog.at_level(logging.DEBUG, "sb3_policyflow"):
+        model.learn(32)
+    assert "Plain torch" not in caplog.text
