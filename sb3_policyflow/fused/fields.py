@@ -126,7 +126,7 @@ class FusedVelocityField(VelocityField):
         # Parts of tensors, such as the starts of a chain's steps, are worth a copy.
         points, times, features = points.contiguous(), times.contiguous(), features.contiguous()
         if not parts.serve(points, features) or not _is_data(times):
-            note_fallback("points, times or features are not float32 on the CPU, or not the field's")
+            note_fallback("a field is asked for what is not its own, or not float32 on the CPU")
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):

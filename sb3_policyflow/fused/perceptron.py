@@ -48,8 +48,8 @@ class Pass:
         """The outputs, shape (n, n_outputs), and what the way back needs, if it is to be kept."""
         network, n_rows = self._network, len(self._first.inputs)
         outputs = th.empty(n_rows, network.n_outputs)
-        # NumPy asks for huge pages. With PyTorch's, FPO's update spent a third of its time waiting for
-        # the system to hand out small ones.
+        # NumPy asks for huge pages. PyTorch does not, and FPO's updates spent a third of their time
+        # waiting for small ones.
         n_kept = n_rows * network.n_hidden if keeps else 0
         kept = th.from_numpy(np.empty((2, n_kept), dtype=np.float32))
         arguments = (
