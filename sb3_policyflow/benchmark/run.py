@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
+from rl_zoo3.utils import StoreDict
 from tqdm import tqdm
 
 from sb3_policyflow.benchmark.results import Cell
@@ -92,6 +93,14 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--envs", nargs="+", required=True, help="ids of environments")
     parser.add_argument("--steps", type=float, required=True, help="environment steps, say 1e6")
     parser.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help="folder of the results")
+    parser.add_argument(
+        "--hyperparams",
+        nargs="+",
+        action=StoreDict,
+        default={},
+        metavar="NAME:VALUE",
+        help="what differs from the YAML files, as rl_zoo3 takes it, for example n_epochs:4",
+    )
     add_running_arguments(parser)
     arguments = parser.parse_args(argv)
     cells = [
@@ -101,6 +110,7 @@ def main(argv: list[str]) -> int:
             env,
             seed,
             int(arguments.steps),
+            arguments.hyperparams,
             n_evaluations=arguments.evaluations,
             n_episodes=arguments.episodes,
         )

@@ -71,6 +71,16 @@ def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
     assert len(load_results(folder)) == 3
 
 
+def test_hyperparams_of_the_command(tmp_path: Path) -> None:
+    settings = ["--hyperparams", "n_envs:2", "n_steps:8", "policy_kwargs:'dict(net_arch=[4])'"]
+    outcome = run(tmp_path, "policyflow", "ppo", *settings)
+    assert outcome.returncode == 0, outcome.stderr
+    for result in load_results(tmp_path):
+        assert result.cell.hyperparams["n_steps"] == 8
+        assert result.summary["timesteps"] == 16
+        assert result.summary["hyperparams"]["policy_kwargs"] == "dict(net_arch=[4])"
+
+
 def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--algos", "fpo", "--envs", "Pendulum-v1", "--steps", "11", "--out", str(folder)]
     assert main(["run", *settings]) == 2
