@@ -62,7 +62,7 @@ def ensure_registered(env_id: str) -> None:
         return
     if env_id.startswith(PLAYGROUND):
         task = env_id.removeprefix(PLAYGROUND).removesuffix("-v0")
-        importlib.import_module("sb3_policyflow.envs.playground").require_task(task)
+        importlib.import_module("sb3_policyflow.envs.playground_tasks").require_task(task)
         _register_playground(task)
     elif env_id.startswith(_ROBOTICS):
         import_extra("gymnasium_robotics", "robotics", env_id)

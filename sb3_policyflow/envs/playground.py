@@ -18,22 +18,17 @@ folder that keeps it between runs.
 
 from __future__ import annotations
 
-import difflib
-import importlib.metadata
-import re
-import subprocess
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.error import DependencyNotInstalled, NameNotFound
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from sb3_policyflow.envs import PLAYGROUND, import_extra
+from sb3_policyflow.envs.playground_tasks import load_task
 from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
 
 if TYPE_CHECKING:
@@ -41,52 +36,8 @@ if TYPE_CHECKING:
     from sb3_policyflow.envs.playground_camera import Camera
 
 METADATA: Info = {"render_modes": ["rgb_array"]}
-OLDEST_VERSION = (0, 2)
 
 FloatArray = NDArray[np.float32]
-
-
-def require_task(task: str) -> None:
-    """Import MuJoCo Playground and look for a task.
-
-    :raises DependencyNotInstalled: if it is missing, too old, or does not work here
-    :raises NameNotFound: if it has no such task; with the nearest names
-    """
-    _require_playground(f"{PLAYGROUND}{task}-v0")
-    from sb3_policyflow.envs.playground_batch import all_tasks
-
-    names = all_tasks()
-    if task not in names:
-        nearest = difflib.get_close_matches(task, names, n=3, cutoff=0.4)
-        advice = f"nearest: {', '.join(nearest)}" if nearest else f"it has {', '.join(names)}"
-        raise NameNotFound(f"MuJoCo Playground has no task {task!r}; {advice}.")
-
-
-def _require_playground(env_id: str) -> None:
-    import_extra("mujoco_playground", "playground", env_id)
-    version = importlib.metadata.version("playground")
-    if tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST_VERSION:
-        oldest = ".".join(map(str, OLDEST_VERSION))
-        raise DependencyNotInstalled(
-            f"{env_id} needs playground {oldest} or newer, and {version} is installed: "
-            "pip install --upgrade 'sb3-policyflow[playground]'"
-        )
-
-
-def _load(
-    task: str, num_envs: int, max_episode_steps: int | None, overrides: Overrides | None
-) -> PlaygroundBatch:
-    require_task(task)
-    from sb3_policyflow.envs.playground_batch import PlaygroundBatch
-
-    try:
-        return PlaygroundBatch(task, num_envs, max_episode_steps, overrides or {})
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise DependencyNotInstalled(
-            f"{PLAYGROUND}{task}-v0 needs the robots of mujoco_menagerie, which Playground clones "
-            f"with git when such a task is first made, and that failed ({error}): try again with "
-            "a connection to GitHub."
-        ) from error
 
 
 class PlaygroundEnv(gym.Env[Any, FloatArray]):
@@ -110,7 +61,7 @@ class PlaygroundEnv(gym.Env[Any, FloatArray]):
         max_episode_steps: int | None = None,
         config_overrides: Overrides | None = None,
     ) -> None:
-        self.batch = _load(task, 1, max_episode_steps, config_overrides)
+        self.batch = load_task(task, 1, max_episode_steps, config_overrides)
         self.metadata = {**METADATA, "render_fps": round(1 / self.batch.env.dt)}
         self.observation_space = self.batch.observation_space()
         self.action_space = self.batch.action_space()
@@ -184,7 +135,7 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     ) -> None:
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.batch = _load(task, num_envs, max_episode_steps, config_overrides)
+        self.batch = load_task(task, num_envs, max_episode_steps, config_overrides)
         self.metadata = {
             **METADATA,
             "render_fps": round(1 / self.batch.env.dt),
