@@ -1,5 +1,6 @@
 import pytest
 
+from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 
 
@@ -29,3 +30,12 @@ def test_negative_or_endless_coefficients_are_refused(value: Coefficient) -> Non
 def test_other_forms_are_refused_with_what_to_write(value: Coefficient) -> None:
     with pytest.raises(ValueError, match=r"brownian_coef must be a number.*'lin_0\.25'"):
         parse_schedule("brownian_coef", value)
+
+
+def test_linear_schedules_end_at_zero_where_the_last_rollout_ends_too_late() -> None:
+    model = PolicyFlow(
+        "MlpPolicy", "Pendulum-v1", lambda progress: 1e-3 * progress, n_steps=64, n_epochs=1
+    )
+    model.learn(100)  # two rollouts, and so 128 steps
+    assert model.num_timesteps == 128
+    assert model.policy.optimizer.param_groups[0]["lr"] == 0.0
