@@ -211,8 +211,8 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last rollout may end beyond total_timesteps, where SB3's figure is negative, and with it
-        # what a linear schedule gives: a learning rate that climbs the loss.
+        # The last rollout may end beyond total_timesteps, where SB3's figure is negative, and with
+        # it a linear schedule: a learning rate that climbs the loss.
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
 
     def _update_learning_rate(
