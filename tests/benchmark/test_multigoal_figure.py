@@ -46,6 +46,8 @@ def test_panels_are_the_papers() -> None:
     assert len(cells) == 18
     assert {cell.algo for cell in cells} == {"ppo", "dppo", "fpo", "policyflow"}
     assert len({cell.path(Path(), ".json") for cell in cells}) == 18
+    assert {cell.steps for cell in cells} == {1000}
+    assert all(cell.hyperparams.items() >= multigoal.ROLLOUTS.items() for cell in cells)
     assert [panel.title[:3] for panel in multigoal.PANELS.values()] == [
         f"({letter})" for letter in "abcdef"
     ]
