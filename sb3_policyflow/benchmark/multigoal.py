@@ -60,7 +60,7 @@ PANELS = {
     "f-brownian": Panel(
         "(f) PolicyFlow, Brownian regulariser",
         "policyflow",
-        PLAIN | {"brownian_coef": "lin_0.35_0.05", "ent_coef": 0.001},
+        PLAIN | {"brownian_coef": 0.2, "ent_coef": 0.001},
     ),
 }
 """The paper's panels (a) to (f)."""
