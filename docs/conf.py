@@ -12,6 +12,6 @@ myst_enable_extensions = ["amsmath", "dollarmath"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "results/*/*.md"]
 html_theme = "furo"
 html_title = "sb3-policyflow"
