@@ -131,6 +131,18 @@ def test_ppo_of_sb3_runs_on_multigoal(installed: Environment, tmp_path: Path) ->
     assert len(list(tmp_path.glob("logs/ppo/MultiGoal-v0_1/*.monitor.csv"))) == 1
 
 
+@pytest.mark.parametrize("algo", ["fpo", "dppo"])
+def test_rivals_train_and_are_enjoyed(installed: Environment, tmp_path: Path, algo: str) -> None:
+    which = ["--algo", algo, "--env", "Pendulum-v1"]
+    output = installed.run(*TRAIN, *which, "-n", "4096", "--eval-freq", "-1", folder=tmp_path)
+    assert re.search(rf"hyperparameters from: .*sb3_policyflow/hyperparams/{algo}\.yml", output)
+    assert f"Saving to logs/{algo}/Pendulum-v1_1" in output
+    options = ["-f", "logs", "--no-render", "-n", "400"]
+    output = installed.run("-m", "rl_zoo3.enjoy", *which, *options, folder=tmp_path)
+    assert f"Loading logs/{algo}/Pendulum-v1_1/Pendulum-v1.zip" in output
+    assert re.search(r"Mean reward: -[\d.]+ ", output)
+
+
 def test_optimize_in_one_command(installed: Environment, tmp_path: Path) -> None:
     options = ["--env", "Pendulum-v1", "--optimize", "--n-trials", "2", "-n", "2000"]
     options += ["--eval-episodes", "1", "--sampler", "random", "--seed", "218", "--no-optim-plots"]
