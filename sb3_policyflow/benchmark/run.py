@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
-from rl_zoo3.utils import StoreDict
 from tqdm import tqdm
 
 from sb3_policyflow.benchmark.results import Cell
@@ -86,6 +85,9 @@ def add_running_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(argv: list[str]) -> int:
     """Run every combination of algorithms, environments and seeds."""
+    # Only this command takes it; the figures' commands, which run cells too, start without rl_zoo3.
+    from rl_zoo3.utils import StoreDict
+
     parser = argparse.ArgumentParser(
         prog="python -m sb3_policyflow.benchmark run", description=__doc__
     )
