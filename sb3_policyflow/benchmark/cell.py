@@ -75,7 +75,11 @@ def _train(
     """Train, and say what it came to and what it took."""
     gradient_steps = costs.GradientSteps(model)
     start = time.perf_counter()
-    model.learn(steps, callback=[*callbacks, evaluations], log_interval=None)  # type: ignore[arg-type]  # SB3 takes None
+    model.learn(
+        _whole_rollouts(model, steps),
+        callback=[*callbacks, evaluations],
+        log_interval=None,  # type: ignore[arg-type]  # SB3 takes None
+    )
     seconds = time.perf_counter() - start - evaluations.seconds
     last = evaluations.curve[-1]["timesteps"]
     final = {row["mode"]: row for row in evaluations.curve if row["timesteps"] == last}
@@ -89,6 +93,16 @@ def _train(
         "threads": th.get_num_threads(),
         "versions": costs.versions(),
     }
+
+
+def _whole_rollouts(model: OnPolicyAlgorithm, steps: int) -> int:
+    """The steps that are collected before there are ``steps`` of them.
+
+    SB3 collects whole rollouts, and goes by the number it was given: beyond it, a learning rate
+    that falls to zero is less than zero, and PPO unlearns in its last update.
+    """
+    rollout = model.n_steps * model.n_envs
+    return -(-steps // rollout) * rollout
 
 
 def _visit_counters(cell: Cell) -> list["VisitCounter"]:

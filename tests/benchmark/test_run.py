@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -16,7 +17,8 @@ pytest.importorskip("rl_zoo3")
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.benchmark import costs
 from sb3_policyflow.benchmark.__main__ import main
-from sb3_policyflow.benchmark.evaluation import evaluate, modes
+from sb3_policyflow.benchmark.cell import _train
+from sb3_policyflow.benchmark.evaluation import EvaluationCallback, evaluate, modes
 from sb3_policyflow.benchmark.results import Cell, Result, load_results
 from sb3_policyflow.benchmark.table import improvement_table, results_table
 
@@ -79,6 +81,20 @@ def test_hyperparams_of_the_command(tmp_path: Path) -> None:
         assert result.cell.hyperparams["n_steps"] == 8
         assert result.summary["timesteps"] == 16
         assert result.summary["hyperparams"]["policy_kwargs"] == "dict(net_arch=[4])"
+
+
+def test_a_falling_learning_rate_ends_at_zero_not_below() -> None:
+    remaining = []
+
+    def schedule(progress_remaining: float) -> float:
+        remaining.append(progress_remaining)
+        return 1e-3 * progress_remaining
+
+    env = make_vec_env("Pendulum-v1", 2)
+    model = PPO("MlpPolicy", env, schedule, n_steps=8, batch_size=16, device="cpu")
+    summary = _train(model, 40, EvaluationCallback(env, [40], n_episodes=1), [])
+    assert summary["timesteps"] == 48
+    assert min(remaining) == 0
 
 
 def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
