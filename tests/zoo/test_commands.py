@@ -123,6 +123,20 @@ def test_mujoco(installed: Environment, tmp_path: Path) -> None:
     assert "Saving to logs/policyflow/HalfCheetah-v5_1" in output
 
 
+@pytest.mark.parametrize(
+    "env_id", ["PointMaze_Medium_Diverse_GDense-v3", "PointMazeMultiGoal-Medium-v0"]
+)
+def test_mazes(installed: Environment, tmp_path: Path, env_id: str) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    which = ["--algo", "policyflow", "--env", env_id]
+    output = installed.run(*TRAIN, *which, "-n", "2048", "--eval-freq", "-1", folder=tmp_path)
+    assert "Using 32 environments" in output
+    options = ["-f", "logs", "--no-render", "-n", "650"]
+    output = installed.run("-m", "rl_zoo3.enjoy", *which, *options, folder=tmp_path)
+    assert f"Loading logs/policyflow/{env_id}_1/{env_id}.zip" in output
+    assert re.search(r"Mean reward: \d+\.\d+ ", output)
+
+
 def test_ppo_of_sb3_runs_on_multigoal(installed: Environment, tmp_path: Path) -> None:
     options = ["--env", "MultiGoal-v0", "-n", "2048", "--eval-freq", "-1"]
     quick = ["-params", "n_steps:2", "batch_size:2048", "n_epochs:1"]
