@@ -98,8 +98,8 @@ def _train(
 def _whole_rollouts(model: OnPolicyAlgorithm, steps: int) -> int:
     """The steps that are collected before there are ``steps`` of them.
 
-    SB3 collects whole rollouts, and goes by the number it was given: beyond it, a learning rate
-    that falls to zero is less than zero, and PPO unlearns in its last update.
+    SB3 collects whole rollouts, but its schedules go by the number it was given: beyond that, a
+    learning rate that falls to zero is less than zero.
     """
     rollout = model.n_steps * model.n_envs
     return -(-steps // rollout) * rollout
