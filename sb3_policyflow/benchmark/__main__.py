@@ -13,6 +13,7 @@ SUBCOMMANDS = {
     "plot": "draw learning curves and probabilities of improvement",
     "multigoal": "the paper's MultiGoal figure",
     "pointmaze": "the paper's exploration maps",
+    "playground": "four algorithms on tasks of MuJoCo Playground",
     "speed": "time PolicyFlow and PPO side by side",
     "environments": "time environments on their own",
     "cell": "one training, as `run` starts it",

@@ -79,8 +79,16 @@ def improvement_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Fig
     return figure
 
 
-def main(argv: list[str]) -> int:
+def write_figures(results: Sequence[Result], folder: Path, mode: str = STOCHASTIC) -> None:
     """Write ``curves.png`` and, for more than one name, ``improvement.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    curves_figure(results, mode).savefig(folder / "curves.png")
+    if len(distinct(results, "name")) > 1:
+        improvement_figure(results, mode).savefig(folder / "improvement.png")
+
+
+def main(argv: list[str]) -> int:
+    """Draw what a folder has."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_policyflow.benchmark plot", description=__doc__
     )
@@ -91,9 +99,5 @@ def main(argv: list[str]) -> int:
     )
     arguments = parser.parse_args(argv)
     results = load_results(arguments.folder)
-    out = arguments.out or arguments.folder
-    out.mkdir(parents=True, exist_ok=True)
-    curves_figure(results, arguments.mode).savefig(out / "curves.png")
-    if len(distinct(results, "name")) > 1:
-        improvement_figure(results, arguments.mode).savefig(out / "improvement.png")
+    write_figures(results, arguments.out or arguments.folder, arguments.mode)
     return 0

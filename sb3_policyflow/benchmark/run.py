@@ -76,11 +76,17 @@ def report_failures(failed: Sequence[Cell]) -> int:
 
 def add_running_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what every command that trains takes."""
+    numbers = {
+        "jobs": (1, "processes at a time"),
+        "threads": (1, "threads of each"),
+        "evaluations": (10, "over the training"),
+        "episodes": (20, "of an evaluation"),
+    }
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="default: 0")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time; default: 1")
-    parser.add_argument("--threads", type=int, default=1, help="threads of each; default: 1")
-    parser.add_argument("--evaluations", type=int, default=10, help="over the training; default 10")
-    parser.add_argument("--episodes", type=int, default=20, help="of an evaluation; default: 20")
+    for name, (default, text) in numbers.items():
+        parser.add_argument(
+            f"--{name}", type=int, default=default, help=f"{text}; default: %(default)s"
+        )
 
 
 def main(argv: list[str]) -> int:

@@ -115,6 +115,14 @@ def _scores(runs: Sequence[Result], mode: str) -> list[float]:
     return [value for value in returns if value is not None]
 
 
+def summary(results: Sequence[Result]) -> str:
+    """The table and, for more than one name, that of the improvements."""
+    parts = [results_table(results)]
+    if len(distinct(results, "name")) > 1:
+        parts.append(improvement_table(results))
+    return "\n\n".join(parts) + "\n"
+
+
 def main(argv: list[str]) -> int:
     """Write the tables to the terminal or to a file."""
     parser = argparse.ArgumentParser(
@@ -123,11 +131,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT_FOLDER)
     parser.add_argument("--out", type=Path, help="a file; the terminal if not given")
     arguments = parser.parse_args(argv)
-    results = load_results(arguments.folder)
-    parts = [results_table(results)]
-    if len(distinct(results, "name")) > 1:
-        parts.append(improvement_table(results))
-    text = "\n\n".join(parts) + "\n"
+    text = summary(load_results(arguments.folder))
     if arguments.out is None:
         sys.stdout.write(text)
     else:
