@@ -147,6 +147,8 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         for name in ("gamma", "gae_lambda"):
             checks.check_between(name, getattr(self, name), 0.0, 1.0)
         checks.check_positive_or_none("target_kl", self.target_kl)
+        if not callable(self.clip_range_vf):
+            checks.check_positive_or_none("clip_range_vf", self.clip_range_vf)
         checks.check_count("n_steps", self.n_steps, 1)
         checks.check_count("n_epochs", self.n_epochs, 1)
         checks.check_batches(self.batch_size, self.n_steps, self.n_envs, self.normalize_advantage)
@@ -169,11 +171,6 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         """Turn coefficients into functions of the remaining progress."""
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
-            if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
-                raise ValueError(
-                    f"clip_range_vf must be positive, or None for no clipping, got "
-                    f"{self.clip_range_vf}."
-                )
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         self._entropy_schedule = parse_schedule("ent_coef", self.ent_coef)
         self._lr_rule: KLAdaptiveLearningRate | None = None

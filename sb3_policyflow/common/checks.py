@@ -56,12 +56,12 @@ def check_positive(name: str, value: object) -> None:
         raise ValueError(f"{name} must be positive, got {value!r}.")
 
 
-def check_positive_or_none(name: str, value: float | None) -> None:
+def check_positive_or_none(name: str, value: object) -> None:
     """Refuse a bound that leaves nothing.
 
-    :raises ValueError: If there is one that is not positive.
+    :raises ValueError: If there is one that is not a positive number.
     """
-    if value is not None and not value > 0:
+    if value is not None and (not isinstance(value, Real) or not float(value) > 0):
         raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
 
 

@@ -30,9 +30,9 @@ class DPPO(SampledEntropyMixin):
     Paper: Diffusion Policy Policy Optimization, https://arxiv.org/abs/2409.00588
 
     PPO's update with one importance ratio for each denoising step, whose likelihood is Gaussian.
-    With ``process="flow"``, ``log_prob_clamp=None``, ``log_prob_reduction="sum"``,
-    ``denoising_gamma=1`` and both stds 0.05, it is what the papers of FPO and PolicyFlow compare
-    with under this name.
+    With ``process="flow"``, ``noise_clip=None``, ``log_prob_clamp=None``,
+    ``log_prob_reduction="sum"``, ``denoising_gamma=1`` and both stds 0.05, it is what the papers of
+    FPO and PolicyFlow compare with under this name.
 
     Takes the arguments of SB3's PPO with its names, order and defaults, those of
     :class:`~sb3_policyflow.common.arguments.FlowAlgorithmArguments`, and:
