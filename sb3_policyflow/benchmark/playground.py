@@ -30,7 +30,11 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "learning_rate": "lin_0.003",
         "clip_range": 0.2,
     },
-    "fpo": {"policy_kwargs": f"dict({NETWORKS},{TIME})", "learning_rate": "lin_0.001"},
+    "fpo": {
+        "policy_kwargs": f"dict({NETWORKS},{TIME})",
+        "learning_rate": "lin_0.001",
+        "difference_clamp": 3,
+    },
     "dppo": {
         "policy_kwargs": f"dict({NETWORKS},{TIME})",
         "learning_rate": "lin_0.001",
@@ -40,7 +44,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "ppo": {"policy_kwargs": f"dict({NETWORKS})", "learning_rate": "lin_0.003"},
 }
 """What differs from the YAML files beside the rollouts: the learning rate, PolicyFlow's clip range
-and DPPO's noise, chosen on CheetahRun (docs/results.md)."""
+and DPPO's noise, chosen on CheetahRun, and FPO's clamp, without which a training became infinite
+(docs/results.md)."""
 
 PANELS = {
     algo: Panel(algo, algo, ROLLOUTS | hyperparams) for algo, hyperparams in ALGORITHMS.items()
