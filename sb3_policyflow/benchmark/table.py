@@ -98,21 +98,32 @@ def improvement_table(results: Sequence[Result], mode: str = STOCHASTIC) -> str:
 
 
 def improvement(results: Sequence[Result], name: str, other: str, mode: str) -> Interval | None:
-    """Probability that one name does better than another; None if they share no environment."""
-    scores: tuple[list[list[float]], list[list[float]]] = ([], [])
-    for env in distinct(results, "env"):
-        pair = [_scores(select(results, who, env), mode) for who in (name, other)]
-        if all(pair):
-            for where, found in zip(scores, pair, strict=True):
-                where.append(found)
-    if not scores[0]:
+    """Probability that one name does better than another, over the environments that both have.
+
+    Of each name the seeds count that it has in all of these; None if there is nothing to compare.
+    """
+    pair = [_scores_by_env(results, who, mode) for who in (name, other)]
+    envs = [env for env in pair[0] if env in pair[1]]
+    matrices = [_common_seeds([scores[env] for env in envs]) for scores in pair]
+    if not all(matrices):
         return None
-    return bootstrap_interval(probability_of_improvement, *map(score_matrix, scores))
+    return bootstrap_interval(probability_of_improvement, *map(score_matrix, matrices))
 
 
-def _scores(runs: Sequence[Result], mode: str) -> list[float]:
-    returns = [run.final_return(mode) for run in runs]
-    return [value for value in returns if value is not None]
+def _scores_by_env(results: Sequence[Result], name: str, mode: str) -> dict[str, dict[int, float]]:
+    """Final returns of one name, by environment and seed."""
+    scores: dict[str, dict[int, float]] = {}
+    for run in results:
+        score = run.final_return(mode)
+        if run.cell.name == name and score is not None:
+            scores.setdefault(run.cell.env, {})[run.cell.seed] = score
+    return scores
+
+
+def _common_seeds(tasks: Sequence[dict[int, float]]) -> list[list[float]]:
+    """Scores of the tasks, of those seeds that all of them have; empty if there are none."""
+    seeds = sorted(set.intersection(*map(set, tasks))) if tasks else []
+    return [[scores[seed] for seed in seeds] for scores in tasks] if seeds else []
 
 
 def summary(results: Sequence[Result]) -> str:

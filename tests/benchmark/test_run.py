@@ -136,14 +136,14 @@ def test_usage(arguments: list[str], code: int, capsys: pytest.CaptureFixture[st
     assert "multigoal" in written.out + written.err
 
 
-def result(name: str, seed: int, value: float) -> Result:
+def result(name: str, seed: int, value: float, env: str = "Pendulum-v1") -> Result:
     summary: dict[str, Any] = {
         "final": {"stochastic": {"mean_return": value}},
         "gradient_steps": 1000,
         "network_evaluations": {"acting": 1e6, "updating": 2e6},
         "seconds": {"training": 90.0},
     }
-    return Result(Cell(name, name, "Pendulum-v1", seed, 100), summary, [])
+    return Result(Cell(name, name, env, seed, 100), summary, [])
 
 
 def test_tables_by_hand() -> None:
@@ -154,6 +154,19 @@ def test_tables_by_hand() -> None:
     assert ours.endswith("| - | - | 1,000 | 1.0 M / 2.0 M | 1.5 |")
     assert "| theirs | 3 |" in theirs
     assert "| ours | theirs | 0.75 [" in improvement_table(results)
+
+
+def test_a_benchmark_that_is_not_complete_is_compared_by_what_it_has() -> None:
+    """Of the seeds, those that a name has in every environment that both names have."""
+    results = [result("ours", seed, value) for seed, value in enumerate([1.0, 3.0])]
+    results += [result("theirs", seed, 2.0) for seed in range(2)]
+    results += [result("ours", 0, 1.0, "Acrobot-v1"), result("theirs", 0, 2.0, "Acrobot-v1")]
+    # Seed 0 only, of both environments: ours is worse in each. Seed 1, better, does not count.
+    assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
+    # An environment that only one of them has leaves the others as they are.
+    results += [result("ours", 7, 9.0, "CartPole-v1"), result("alone", 0, 9.0, "CartPole-v1")]
+    assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
+    assert "| alone | theirs |" not in improvement_table(results)
 
 
 def test_results_survive_saving(tmp_path: Path) -> None:
