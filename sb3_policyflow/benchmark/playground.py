@@ -10,7 +10,7 @@ from sb3_policyflow.benchmark.panels import Panel, panel_cells, panel_parser
 from sb3_policyflow.benchmark.plot import write_figures
 from sb3_policyflow.benchmark.results import load_results
 from sb3_policyflow.benchmark.run import report_failures, run_cells
-from sb3_policyflow.benchmark.table import summary
+from sb3_policyflow.benchmark.table import overall_table, summary
 
 TASKS = ("CartpoleBalance", "ReacherHard", "CheetahRun", "FingerSpin")
 
@@ -66,5 +66,7 @@ def main(argv: list[str]) -> int:
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
     results = load_results(arguments.out)
     write_figures(results, arguments.out)
-    (arguments.out / "table.md").write_text(summary(results), encoding="utf-8")
+    # Returns of all tasks of the control suite are from 0 to 1000.
+    text = f"{overall_table(results)}\n\n{summary(results)}"
+    (arguments.out / "table.md").write_text(text, encoding="utf-8")
     return report_failures(failed)

@@ -87,6 +87,30 @@ def format_interval(interval: Interval) -> str:
     return f"{interval.estimate:.4g} [{interval.low:.4g}, {interval.high:.4g}]"
 
 
+def overall_table(results: Sequence[Result]) -> str:
+    """A row for each name: over all environments together, whose returns must be of one scale.
+
+    Environments count that all names have, and seeds that a name has in all of these.
+    """
+    names = distinct(results, "name")
+    envs = [env for env in distinct(results, "env") if all(select(results, n, env) for n in names)]
+    shared = [run for run in results if run.cell.env in envs]
+    rows = []
+    for name in names:
+        scores = [
+            _common_seeds(list(_scores_by_env(shared, name, mode).values())) for mode in MODES
+        ]
+        n_seeds = len(scores[0][0]) if scores[0] else 0
+        rows.append([name, f"{len(envs)} x {n_seeds}", *map(_overall, scores)])
+    return markdown_table(("algorithm", "environments x seeds", *MODES), rows)
+
+
+def _overall(scores: Sequence[Sequence[float]]) -> str:
+    if not scores:
+        return "-"
+    return format_interval(bootstrap_interval(interquartile_mean, score_matrix(scores)))
+
+
 def improvement_table(results: Sequence[Result], mode: str = STOCHASTIC) -> str:
     """Probabilities that one name does better than another, over all environments of both."""
     rows = []

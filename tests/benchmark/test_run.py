@@ -20,7 +20,7 @@ from sb3_policyflow.benchmark.__main__ import main
 from sb3_policyflow.benchmark.cell import _train
 from sb3_policyflow.benchmark.evaluation import EvaluationCallback, evaluate, modes
 from sb3_policyflow.benchmark.results import Cell, Result, load_results
-from sb3_policyflow.benchmark.table import improvement_table, results_table
+from sb3_policyflow.benchmark.table import improvement_table, overall_table, results_table
 
 
 def benchmark(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -161,12 +161,22 @@ def test_a_benchmark_that_is_not_complete_is_compared_by_what_it_has() -> None:
     results = [result("ours", seed, value) for seed, value in enumerate([1.0, 3.0])]
     results += [result("theirs", seed, 2.0) for seed in range(2)]
     results += [result("ours", 0, 1.0, "Acrobot-v1"), result("theirs", 0, 2.0, "Acrobot-v1")]
+    # Of "ours" over both environments: seed 0, with 1 in each.
+    assert "| ours | 2 x 1 | 1 [1, 1] | - | - |" in overall_table(results)
     # Seed 0 only, of both environments: ours is worse in each. Seed 1, better, does not count.
     assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
     # An environment that only one of them has leaves the others as they are.
     results += [result("ours", 7, 9.0, "CartPole-v1"), result("alone", 0, 9.0, "CartPole-v1")]
     assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
     assert "| alone | theirs |" not in improvement_table(results)
+    assert "| theirs | 0 x 0 | - | - | - |" in overall_table(results)
+
+
+def test_overall_table_by_hand() -> None:
+    """The interquartile mean of 0, 1, ..., 7 is that of 2, 3, 4, 5."""
+    results = [result("a", seed, float(seed), "CartPole-v1") for seed in range(4)]
+    results += [result("a", seed, 4.0 + seed, "Acrobot-v1") for seed in range(4)]
+    assert "| a | 2 x 4 | 3.5 [" in overall_table(results)
 
 
 def test_results_survive_saving(tmp_path: Path) -> None:
