@@ -4,6 +4,7 @@ A curve is the interquartile mean over seeds, its band the 95 % bootstrap interv
 """
 
 import argparse
+import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from sb3_policyflow.benchmark.evaluation import DETERMINISTIC, LATENT_ONLY, STOCHASTIC
 from sb3_policyflow.benchmark.plots import DPI, GREY, SERIES_COLOURS, style_curves
@@ -20,22 +22,25 @@ from sb3_policyflow.benchmark.statistics import bootstrap_interval, interquartil
 from sb3_policyflow.benchmark.table import improvement
 from sb3_policyflow.envs.drawing import INK
 
-N_COLUMNS = 3
+MOST_COLUMNS = 3
 
 
 def curves_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Figure:
-    """A panel for each environment, a line for each name."""
+    """A panel for each environment, a line for each name; the legend is below all panels."""
     envs, names = distinct(results, "env"), distinct(results, "name")
-    n_columns = min(N_COLUMNS, len(envs))
+    n_columns = min(MOST_COLUMNS, math.ceil(math.sqrt(len(envs))))
     n_rows = -(-len(envs) // n_columns)
     figure = Figure(figsize=(4.2 * n_columns, 3.2 * n_rows), dpi=DPI, layout="constrained")
     panels = np.ravel(figure.subplots(n_rows, n_columns, squeeze=False))
     for axes, env in zip(panels, envs, strict=False):
         for name, colour in zip(names, _colours(len(names)), strict=True):
             _draw_curve(axes, select(results, name, env), mode, colour)
-        style_curves(axes, env, len(names))
+        style_curves(axes, env)
     for axes in panels[len(envs) :]:
         axes.set_visible(False)
+    if len(names) > 1:
+        lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in _colours(len(names))]
+        figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
     return figure
 
 

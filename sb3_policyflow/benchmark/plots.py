@@ -121,7 +121,9 @@ def learning_curve_figure(
         paths = [files] if isinstance(files, str | Path) else files
         curves = [read_learning_curve(path) for path in paths]
         _draw_curves(axes, name, curves, SERIES_COLOURS[i % len(SERIES_COLOURS)])
-    style_curves(axes, title, n_lines=len(runs))
+    style_curves(axes, title)
+    if len(runs) > 1:
+        axes.legend(frameon=False, fontsize=8, labelcolor=INK)
     return figure
 
 
@@ -138,7 +140,7 @@ def _draw_curves(
         axes.fill_between(grid, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
-def style_curves(axes: Axes, title: str, n_lines: int) -> None:
+def style_curves(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10, color=INK, loc="left")
     axes.set_xlabel("environment steps", fontsize=9, color=INK)
     axes.set_ylabel("mean episode return", fontsize=9, color=INK)
@@ -149,8 +151,6 @@ def style_curves(axes: Axes, title: str, n_lines: int) -> None:
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.spines["bottom"].set_color(PALE)
     axes.margins(x=0.01)
-    if n_lines > 1:
-        axes.legend(frameon=False, fontsize=8, labelcolor=INK)
 
 
 def read_learning_curve(path: str | Path) -> tuple[FloatArray, FloatArray]:
