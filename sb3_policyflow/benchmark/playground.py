@@ -1,7 +1,7 @@
 """PolicyFlow and its rivals on tasks of MuJoCo Playground, with a budget for a small machine.
 
-Trains what is missing, with every task and seed, and writes ``table.md``, ``curves.png`` and
-``improvement.png``. Needs the extra ``playground``.
+Trains what is missing, with every task and seed, and sums up these tasks in ``table.md``,
+``curves.png`` and ``improvement.png``. Needs the extra ``playground``.
 """
 
 from typing import Any
@@ -58,13 +58,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--tasks", nargs="+", default=TASKS, help="default: all four")
     parser.set_defaults(evaluations=5, episodes=10)
     arguments = parser.parse_args(argv)
-    cells = [
-        cell
-        for task in arguments.tasks
-        for cell in panel_cells(PANELS, arguments, env=f"Playground/{task}-v0")
-    ]
+    envs = [f"Playground/{task}-v0" for task in arguments.tasks]
+    cells = [cell for env in envs for cell in panel_cells(PANELS, arguments, env=env)]
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
-    results = load_results(arguments.out)
+    results = [run for run in load_results(arguments.out) if run.cell.env in envs]
     write_figures(results, arguments.out)
     # Returns of all tasks of the control suite are from 0 to 1000.
     text = f"{overall_table(results)}\n\n{summary(results)}"
