@@ -1,0 +1,43 @@
+"""The results in ``docs/results`` are those of the figures' commands as they are now."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("gymnasium_robotics")
+
+from sb3_policyflow.benchmark import multigoal, playground, pointmaze
+from sb3_policyflow.benchmark.panels import Panels, panel_cells
+from sb3_policyflow.envs.point_maze import ENV_ID
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+
+
+def n_done(folder: str, panels: Panels, n_evaluations: int, steps: int, **fields: Any) -> int:
+    """How many trainings of three seeds have been run; other settings are an error."""
+    arguments = Namespace(panels=panels, seeds=[0, 1, 2], steps=steps)
+    arguments.evaluations, arguments.episodes = n_evaluations, 2 * n_evaluations
+    cells = panel_cells(panels, arguments, **fields)
+    return sum(cell.is_done(RESULTS / folder) for cell in cells)
+
+
+def test_multigoal() -> None:
+    fields = {"env": multigoal.ENV, "n_trajectories": multigoal.N_TRAJECTORIES}
+    assert n_done("multigoal", multigoal.PANELS, 10, 3_000_000, **fields) == 18
+
+
+def test_pointmaze() -> None:
+    fields = {"env": ENV_ID, "keep_visits": True}
+    assert n_done("pointmaze", pointmaze.PANELS, 10, 2_000_000, **fields) == 9
+
+
+@pytest.mark.parametrize(
+    ("task", "n_cells"),
+    [("CartpoleBalance", 12), ("ReacherHard", 12), ("CheetahRun", 12), ("FingerSpin", 4)],
+)
+def test_playground(task: str, n_cells: int) -> None:
+    env = f"Playground/{task}-v0"
+    assert n_done("playground", playground.PANELS, 5, 3_000_000, env=env) == n_cells
