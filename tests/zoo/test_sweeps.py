@@ -110,7 +110,7 @@ def test_workers_share_a_study_and_one_is_killed(
     outputs = [worker.communicate()[0] for worker in workers]
 
     assert victim.wait() == -signal.SIGKILL
-    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    assert [worker.returncode for worker in workers] == [0, 0], "\n".join(outputs)
     # Each has had a trial of its own.
     assert all("finished with value" in output for output in outputs)
     states = [trial.state for trial in study.trials]
