@@ -115,5 +115,6 @@ def main(argv: list[str]) -> int:
     arguments = panel_parser("multigoal", __doc__, PANELS, steps=3e6).parse_args(argv)
     cells = panel_cells(PANELS, arguments, env=ENV, n_trajectories=N_TRAJECTORIES)
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
+    code = report_failures(failed)
     draw(arguments.out, load_results(arguments.out))
-    return report_failures(failed)
+    return code

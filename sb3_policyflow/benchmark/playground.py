@@ -9,8 +9,9 @@ from typing import Any
 from sb3_policyflow.benchmark.panels import Panel, panel_cells, panel_parser
 from sb3_policyflow.benchmark.plot import write_figures
 from sb3_policyflow.benchmark.results import load_results
-from sb3_policyflow.benchmark.run import report_failures, run_cells
+from sb3_policyflow.benchmark.run import report_failures, require_env, run_cells
 from sb3_policyflow.benchmark.table import overall_table, summary
+from sb3_policyflow.envs import PLAYGROUND
 
 TASKS = ("CartpoleBalance", "ReacherHard", "CheetahRun", "FingerSpin")
 
@@ -58,12 +59,15 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--tasks", nargs="+", default=TASKS, help="default: all four")
     parser.set_defaults(evaluations=5, episodes=10)
     arguments = parser.parse_args(argv)
-    envs = [f"Playground/{task}-v0" for task in arguments.tasks]
+    envs = [f"{PLAYGROUND}{task}-v0" for task in arguments.tasks]
+    for env in envs:
+        require_env(env)
     cells = [cell for env in envs for cell in panel_cells(PANELS, arguments, env=env)]
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
-    results = [run for run in load_results(arguments.out) if run.cell.env in envs]
+    code = report_failures(failed)
+    results = load_results(arguments.out, envs)
     write_figures(results, arguments.out)
     # Returns of all tasks of the control suite are from 0 to 1000.
     text = f"{overall_table(results)}\n\n{summary(results)}"
     (arguments.out / "table.md").write_text(text, encoding="utf-8")
-    return report_failures(failed)
+    return code

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from sb3_policyflow.benchmark.evaluation import DETERMINISTIC, LATENT_ONLY, STOCHASTIC
 from sb3_policyflow.benchmark.plots import DPI, GREY, SERIES_COLOURS, style_curves
-from sb3_policyflow.benchmark.results import Result, distinct, load_results, select
+from sb3_policyflow.benchmark.results import Result, ResultsError, distinct, load_results, select
 from sb3_policyflow.benchmark.run import DEFAULT_FOLDER
 from sb3_policyflow.benchmark.statistics import bootstrap_interval, interquartile_mean, score_matrix
 from sb3_policyflow.benchmark.table import improvement
@@ -53,8 +53,13 @@ def _draw_curve(axes: Axes, runs: Sequence[Result], mode: str, colour: str) -> N
     curves = [curve for curve in curves if curve[0]]
     if not curves:
         return
-    # Runs of one name are evaluated at the same timesteps.
     timesteps = curves[0][0]
+    if any(curve[0] != timesteps for curve in curves):
+        cell = runs[0].cell
+        raise ResultsError(
+            f"The seeds of {cell.name} in {cell.env} were not evaluated at the same timesteps, so "
+            "there is no curve of them: keep trainings of different lengths in different folders."
+        )
     points = [score_matrix([list(scores)]) for scores in zip(*(c[1] for c in curves), strict=True)]
     intervals = np.array([bootstrap_interval(interquartile_mean, scores) for scores in points])
     axes.plot(timesteps, intervals[:, 0], color=colour, linewidth=1.8, label=runs[0].cell.name)

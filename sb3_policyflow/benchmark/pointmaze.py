@@ -63,5 +63,6 @@ def main(argv: list[str]) -> int:
     arguments = panel_parser("pointmaze", __doc__, PANELS, steps=2e6).parse_args(argv)
     cells = panel_cells(PANELS, arguments, env=ENV_ID, keep_visits=True)
     failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
+    code = report_failures(failed)
     draw(arguments.out, load_results(arguments.out))
-    return report_failures(failed)
+    return code

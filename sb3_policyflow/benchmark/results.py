@@ -97,14 +97,18 @@ class Result:
         return [row["timesteps"] for row in rows], [row["mean_return"] for row in rows]
 
 
-def load_results(folder: Path) -> list[Result]:
-    """Everything that has been run, in the order of names, environments and seeds.
+def load_results(folder: Path, envs: Sequence[str] = ()) -> list[Result]:
+    """What has been run, in the order of names, environments and seeds.
 
+    :param folder: Where it is.
+    :param envs: Environments to take; all if not given.
     :raises ResultsError: If there is nothing.
     """
     results = [_load(path) for path in folder.glob("*/*/seed-*.json")]
+    results = [result for result in results if not envs or result.cell.env in envs]
     if not results:
-        raise ResultsError(f"No results in {folder}: make some with the subcommand run.")
+        which = f" of {', '.join(envs)}" if envs else ""
+        raise ResultsError(f"No results{which} in {folder}: make some with the subcommand run.")
     return sorted(results, key=lambda r: (r.cell.name, r.cell.env, r.cell.seed))
 
 

@@ -10,9 +10,11 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
+import gymnasium as gym
 from tqdm import tqdm
 
-from sb3_policyflow.benchmark.results import Cell
+from sb3_policyflow.benchmark.results import Cell, ResultsError
+from sb3_policyflow.envs import ensure_registered
 
 DEFAULT_FOLDER = Path("benchmark-results")
 
@@ -74,6 +76,18 @@ def report_failures(failed: Sequence[Cell]) -> int:
     return 1 if failed else 0
 
 
+def require_env(env_id: str) -> None:
+    """See whether there is an environment, before trainings are started in it.
+
+    :raises ResultsError: If there is none, or what it needs is missing.
+    """
+    try:
+        ensure_registered(env_id)
+        gym.spec(env_id)
+    except gym.error.Error as error:
+        raise ResultsError(str(error)) from error
+
+
 def add_running_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what every command that trains takes."""
     numbers = {
@@ -111,6 +125,8 @@ def main(argv: list[str]) -> int:
     )
     add_running_arguments(parser)
     arguments = parser.parse_args(argv)
+    for env in arguments.envs:
+        require_env(env)
     cells = [
         Cell(
             algo,

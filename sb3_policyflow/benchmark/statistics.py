@@ -3,6 +3,7 @@
 The same figures as the package rliable's, in numpy. Scores are arrays (n_seeds, n_tasks).
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ Scores = NDArray[np.float64]
 
 
 class Interval(NamedTuple):
-    """An estimate and the ends of its confidence interval."""
+    """An estimate and the ends of its confidence interval; NaN if there is only one seed."""
 
     estimate: float
     low: float
@@ -52,12 +53,16 @@ def bootstrap_interval(
 ) -> Interval:
     """A statistic with its percentile bootstrap interval, resampled within each task.
 
+    If there is only one seed of everything, there is nothing to resample, and no interval.
+
     :param statistic: A function of one or more arrays of scores.
     :param scores: What it is taken of.
     :param n_resamples: Resamples.
     :param confidence: Share of the resamples between the interval's ends.
     :param seed: Of the resamples.
     """
+    if all(len(array) == 1 for array in scores):
+        return Interval(statistic(*scores), math.nan, math.nan)
     generator = np.random.default_rng(seed)
     values = [
         statistic(*(_resample(array, generator) for array in scores)) for _ in range(n_resamples)

@@ -4,6 +4,7 @@ Intervals are from the percentile bootstrap over seeds; of one seed there is non
 """
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from itertools import permutations
@@ -72,18 +73,17 @@ def _returns(returns: Sequence[float | None]) -> str:
     scores = [value for value in returns if value is not None]
     if not scores:
         return "-"
-    matrix = score_matrix([scores])
-    if len(scores) == 1:
-        return f"{interquartile_mean(matrix):.4g}"
-    return format_interval(bootstrap_interval(interquartile_mean, matrix))
+    return format_interval(bootstrap_interval(interquartile_mean, score_matrix([scores])))
 
 
 def format_interval(interval: Interval) -> str:
-    """Estimate and interval with three digits or more.
+    """Estimate and interval with three digits or more; the estimate alone if there is no other.
 
     >>> format_interval(Interval(-151.23, -180.0, -140.4))
     '-151.2 [-180, -140.4]'
     """
+    if math.isnan(interval.low):
+        return f"{interval.estimate:.4g}"
     return f"{interval.estimate:.4g} [{interval.low:.4g}, {interval.high:.4g}]"
 
 

@@ -6,22 +6,13 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.error import DependencyNotInstalled
 
-PLAYGROUND = "Playground/"
-"""What the ids of MuJoCo Playground's tasks begin with."""
-
-PLAYGROUND_TASKS = (
-    "BallInCup",
-    "CartpoleBalance",
-    "CheetahRun",
-    "FingerSpin",
-    "FingerTurnEasy",
-    "FingerTurnHard",
-    "FishSwim",
-    "ReacherEasy",
-    "ReacherHard",
-    "WalkerWalk",
+from sb3_policyflow.envs.playground_names import (
+    OTHER_PLAYGROUND_TASKS,
+    PLAYGROUND,
+    PLAYGROUND_TASKS,
 )
-"""The paper's tasks of MuJoCo Playground. Others are registered on demand."""
+
+__all__ = ["PLAYGROUND", "PLAYGROUND_TASKS", "ensure_registered", "import_extra", "register"]
 
 _ROBOTICS = ("Adroit", "AntMaze", "Fetch", "Franka", "Hand", "PointMaze")
 """Beginnings of gymnasium-robotics' environment ids."""
@@ -43,7 +34,7 @@ def register() -> None:
         entry_point="sb3_policyflow.envs.point_maze:PointMazeMultiGoalEnv",
         max_episode_steps=600,
     )
-    for task in PLAYGROUND_TASKS:
+    for task in PLAYGROUND_TASKS + OTHER_PLAYGROUND_TASKS:
         _register_playground(task)
 
 
@@ -51,10 +42,11 @@ def ensure_registered(env_id: str) -> None:
     """Register an environment that this package knows of, if it is not registered yet.
 
     Call it before ``gymnasium.make`` where an id comes from a user: it imports gymnasium-robotics
-    for its ids, and registers any task of MuJoCo Playground as ``Playground/NAME-v0``. Other ids
-    are left to ``gymnasium.make``, whose error names the nearest ones.
+    for its ids, and registers a task that has been added to MuJoCo Playground as
+    ``Playground/NAME-v0``. Other ids are left to ``gymnasium.make``, whose error names the nearest
+    ones.
 
-    :param env_id: for instance ``PointMaze_Medium_Diverse_GDense-v3``, ``Playground/HopperHop-v0``
+    :param env_id: for instance ``PointMaze_Medium_Diverse_GDense-v3``, ``Playground/MyTask-v0``
     :raises DependencyNotInstalled: if the package that has it is missing or does not work
     :raises NameNotFound: if MuJoCo Playground has no such task
     """
@@ -102,7 +94,8 @@ def import_extra(module: str, extra: str, env_id: str) -> None:
 
 
 def _broken(module: str, env_id: str, command: str, error: Exception) -> DependencyNotInstalled:
+    first_line = next(iter(str(error).splitlines()), "")
     return DependencyNotInstalled(
         f"{env_id} needs {module}, which does not go with the packages installed here "
-        f"({type(error).__name__}: {error}): {command} --upgrade"
+        f"({type(error).__name__}: {first_line}): {command} --upgrade"
     )

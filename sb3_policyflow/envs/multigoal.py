@@ -221,4 +221,10 @@ class MultiGoalVecEnv(GymVectorVecEnv):
         self.env.set_state(state)
 
     def _batch_options(self, options: Any) -> Info:
-        return {key: np.stack([row[key] for row in options]) for key in options[0]}
+        keys = set(options[0])
+        if any(set(row) != keys for row in options):
+            raise ValueError(
+                "A list of reset options must have the same keys for all environments, not "
+                f"{[sorted(row) for row in options]}."
+            )
+        return {key: np.stack([row[key] for row in options]) for key in keys}

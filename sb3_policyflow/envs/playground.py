@@ -47,9 +47,11 @@ class PlaygroundEnv(gym.Env[Any, FloatArray]):
 
     :param task: name of the task, for instance ``"CheetahRun"``
     :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated; None for the task's own
+    :param max_episode_steps: steps after which an episode is truncated; None for the task's own.
+        That of ``gymnasium.make`` is a wrapper's, and can only end episodes sooner:
+        ``config_overrides={"episode_length": ...}`` sets any limit
     :param config_overrides: changes to Playground's configuration of the task, such as
-        ``{"impl": "warp", "sim_dt": 0.005}``
+        ``{"impl": "warp", "sim_dt": 0.005}``; nested, or with dots in its keys
     """
 
     metadata = METADATA

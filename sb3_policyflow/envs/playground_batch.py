@@ -39,15 +39,42 @@ def task_config(task: str, overrides: Overrides) -> Any:
     config = registry.get_default_config(task)
     if "impl" in config and jax.default_backend() == "cpu":
         config.impl = "jax"
-    known = config.to_dict()
-    for key in overrides:
-        if key.split(".", maxsplit=1)[0] not in known:
-            raise ValueError(
-                f"Playground's {task} has no setting {key!r} that config_overrides could change; "
-                f"it has {', '.join(sorted(known))}."
-            )
-    config.update_from_flattened_dict(dict(overrides))
+    changes = _flatten(overrides)
+    for key in changes:
+        _require_setting(task, config.to_dict(), key)
+    config.update_from_flattened_dict(changes)
     return config
+
+
+def _flatten(overrides: Overrides) -> dict[str, Any]:
+    """Nested dictionaries as one, with dots in its keys.
+
+    >>> _flatten({"sim_dt": 0.01, "noise": {"level": 2, "scales.joint": 3}})
+    {'sim_dt': 0.01, 'noise.level': 2, 'noise.scales.joint': 3}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in overrides.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{key}.{name}": leaf for name, leaf in _flatten(value).items()})
+        else:
+            flat[key] = value
+    return flat
+
+
+def _require_setting(task: str, known: Any, key: str) -> None:
+    """See whether a key with dots is in nested settings: the engine would add it, and not use it.
+
+    :raises ValueError: if it is not, with the names that are there
+    """
+    parts = key.split(".")
+    for depth, part in enumerate(parts):
+        if not isinstance(known, Mapping) or part not in known:
+            there = ", ".join(sorted(known)) if isinstance(known, Mapping) else "no settings in it"
+            raise ValueError(
+                f"Playground's {task} has no setting {key!r} that config_overrides could change: "
+                f"{'.'.join(parts[:depth]) or 'it'} has {there}."
+            )
+        known = known[part]
 
 
 class PlaygroundBatch:
@@ -180,15 +207,22 @@ class PlaygroundBatch:
         return jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), state, after)
 
     def _advance(self, state: Tree, actions: Tree) -> Tree:
-        reward = jnp.zeros(self.num_envs)
-        for _ in range(self._action_repeat):
-            state = jax.vmap(self.env.step)(state, actions)
-            is_broken = (state.done > 0) & jnp.isnan(state.reward)
-            reward = reward + jnp.where(is_broken, 0, state.reward)
+        state, reward = self._advance_once(state, actions)
+        for _ in range(self._action_repeat - 1):
+            has_ended = state.done > 0
+            after, more = self._advance_once(state, actions)
+            state = self._replace(has_ended, state, after)
+            reward = reward + jnp.where(has_ended, 0, more)
         # An explicit type is a strong one: a weak one would have the next step compiled again.
         return jax.tree.map(
             lambda leaf: jnp.asarray(leaf, leaf.dtype), state.replace(reward=reward)
         )
+
+    def _advance_once(self, state: Tree, actions: Tree) -> tuple[Tree, Tree]:
+        """The next states, and rewards without those of broken simulations."""
+        state = jax.vmap(self.env.step)(state, actions)
+        is_broken = (state.done > 0) & jnp.isnan(state.reward)
+        return state, jnp.where(is_broken, 0, state.reward)
 
     def _replace(self, which: Tree, fresh: Tree, state: Tree) -> Tree:
         def replace(new: Tree, old: Tree) -> Tree:

@@ -35,14 +35,18 @@ def require_task(task: str) -> None:
 
 
 def _require_playground(env_id: str) -> None:
-    import_extra("mujoco_playground", "playground", env_id)
-    version = importlib.metadata.version("playground")
-    if tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST_VERSION:
+    """Look at the version first: an old one may fail when it is imported, and say little."""
+    try:
+        version = importlib.metadata.version("playground")
+    except importlib.metadata.PackageNotFoundError:
+        version = None  # missing, or a checkout on the path
+    if version and tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST_VERSION:
         oldest = ".".join(map(str, OLDEST_VERSION))
         raise DependencyNotInstalled(
             f"{env_id} needs playground {oldest} or newer, and {version} is installed: "
             "pip install --upgrade 'sb3-policyflow[playground]'"
         )
+    import_extra("mujoco_playground", "playground", env_id)
 
 
 def load_task(
@@ -59,8 +63,17 @@ def load_task(
     try:
         return PlaygroundBatch(task, num_envs, max_episode_steps, overrides or {})
     except (OSError, subprocess.CalledProcessError) as error:
+        if not _is_about_robots(error):
+            raise
         raise DependencyNotInstalled(
             f"{PLAYGROUND}{task}-v0 needs the robots of mujoco_menagerie, which Playground clones "
             f"with git when such a task is first made, and that failed ({error}): try again with "
             "a connection to GitHub."
         ) from error
+
+
+def _is_about_robots(error: OSError | subprocess.CalledProcessError) -> bool:
+    """Whether git failed or is missing, or its clone of mujoco_menagerie is not whole."""
+    if isinstance(error, subprocess.CalledProcessError):
+        return True
+    return error.filename == "git" or "mujoco_menagerie" in str(error.filename)

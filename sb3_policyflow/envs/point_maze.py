@@ -81,6 +81,7 @@ class PointMazeMultiGoalEnv(gym.Env[FloatArray, NDArray[np.float32]]):
         goal_cells: Sequence[Cell] = GOAL_CELLS,
     ) -> None:
         self.maze = medium_maze()
+        start_cell, *goal_cells = ((row, column) for row, column in (start_cell, *goal_cells))
         _require_free(self.maze, (start_cell, *goal_cells))
         self.start = cell_centre(start_cell, self.maze)
         self.goals: FloatArray = np.stack([cell_centre(cell, self.maze) for cell in goal_cells])
@@ -93,7 +94,12 @@ class PointMazeMultiGoalEnv(gym.Env[FloatArray, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
     ) -> tuple[FloatArray, Info]:
-        super().reset(seed=seed, options=options)
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(
+                f"{ENV_ID} always begins at the same place: reset takes no options {options}, but "
+                "gymnasium.make takes start_cell."
+            )
         observation: FloatArray = self.simulation.reset(seed=seed)[0]["observation"]
         self._trail = [self.start]
         return observation, self._info(observation)
@@ -137,7 +143,7 @@ def _stock_environment(
 
 def _require_free(maze: NDArray[np.bool_], cells: Sequence[Cell]) -> None:
     free = {(int(row), int(column)) for row, column in np.argwhere(maze)}
-    walls = [tuple(cell) for cell in cells if tuple(cell) not in free]
+    walls = [cell for cell in cells if cell not in free]
     if walls or len(set(cells)) < len(cells) or len(cells) < 2:
         raise ValueError(
             "The start and the goals (at least one) must be different free cells (row, column) of "

@@ -70,6 +70,8 @@ class GymVectorVecEnv(VecEnv):
         self.spec = env.spec  # VecMonitor names the environment in its file
         self._actions: NDArray[Any] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        # SB3 keeps the modes only, and its VecVideoRecorder wants to know the frames per second.
+        self.metadata = {**env.metadata, **self.metadata}
 
     def reset(self) -> VecEnvObs:
         observations: VecEnvObs

@@ -42,6 +42,8 @@ def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
 def _vectorise(sample: Monitor, num_envs: int) -> VecEnv | None:
     spec = sample.env.spec  # with the user's env_kwargs
     assert spec is not None
+    if spec.additional_wrappers:
+        return None
     vector_env = gym.make_vec(spec, num_envs, vectorization_mode="vector_entry_point")
     if vector_env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         vector_env.close()

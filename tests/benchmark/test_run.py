@@ -19,7 +19,8 @@ from sb3_policyflow.benchmark import costs
 from sb3_policyflow.benchmark.__main__ import main
 from sb3_policyflow.benchmark.cell import _train
 from sb3_policyflow.benchmark.evaluation import EvaluationCallback, evaluate, modes
-from sb3_policyflow.benchmark.results import Cell, Result, load_results
+from sb3_policyflow.benchmark.plot import curves_figure
+from sb3_policyflow.benchmark.results import Cell, Result, ResultsError, load_results
 from sb3_policyflow.benchmark.table import improvement_table, overall_table, results_table
 
 
@@ -104,14 +105,53 @@ def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[
 
 
 def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
-    outcome = benchmark(
-        "run", "--algos", "fpo", "--envs", "NoSuch-v0", "--steps", "10", "--out", str(tmp_path)
-    )
+    outcome = run(tmp_path, "fpo", "--hyperparams", "n_steps:-1")
     assert outcome.returncode == 1
-    assert "failed: fpo NoSuch-v0 seed 0" in outcome.stderr
-    log = (tmp_path / "fpo/NoSuch-v0/seed-0.log").read_text()
-    assert "NoSuch" in log
+    assert "failed: fpo Pendulum-v1 seed 0" in outcome.stderr
+    log = (tmp_path / "fpo/Pendulum-v1/seed-0.log").read_text()
+    assert "n_steps" in log
     assert log.endswith("exit code 1\n")
+
+
+def test_a_figure_says_what_failed_though_there_is_nothing_to_draw(tmp_path: Path) -> None:
+    settings = ["--steps", "10", "--panels", "a-ppo", "--out", str(tmp_path)]
+    # No evaluation after -1 episodes: the training fails.
+    outcome = benchmark("multigoal", *settings, "--episodes", "-1")
+    assert outcome.returncode == 2
+    assert "failed: a-ppo MultiGoal-v0 seed 0\nNo results in" in outcome.stderr
+
+
+@pytest.mark.parametrize("subcommand", ["run", "playground"])
+def test_environments_that_there_are_not_are_named_before_a_training(
+    subcommand: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    which = {"run": ["--envs", "Pendulun-v1"], "playground": ["--tasks", "CheetaRun"]}
+    settings = ["--steps", "10", "--out", str(tmp_path)]
+    assert main([subcommand, *which[subcommand], *settings]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "Pendulum" in said or "CheetahRun" in said or "playground" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_results_of_some_environments(tmp_path: Path) -> None:
+    for env in ("Pendulum-v1", "Acrobot-v1"):
+        result("ours", 0, 1.0, env).save(tmp_path)
+    assert [run.cell.env for run in load_results(tmp_path, ["Acrobot-v1"])] == ["Acrobot-v1"]
+    with pytest.raises(ResultsError, match="No results of CartPole-v1"):
+        load_results(tmp_path, ["CartPole-v1"])
+
+
+def test_there_is_no_curve_of_seeds_that_were_evaluated_at_different_timesteps() -> None:
+    def curve(seed: int, *timesteps: float) -> Result:
+        rows = [{"timesteps": t, "mode": "stochastic", "mean_return": t} for t in timesteps]
+        cell = Cell("ours", "ppo", "Pendulum-v1", seed, 100)
+        return Result(cell, {"final": {}}, rows)
+
+    lines = curves_figure([curve(0, 50, 100), curve(1, 50, 100)]).axes[0].lines
+    assert lines[0].get_xydata().tolist() == [[50, 50], [100, 100]]  # type: ignore[union-attr]
+    with pytest.raises(ResultsError, match="ours in Pendulum-v1 were not evaluated at the same"):
+        curves_figure([curve(0, 50, 100), curve(1, 500, 1000)])
 
 
 def test_table_and_plot(folder: Path, tmp_path: Path) -> None:
@@ -162,12 +202,12 @@ def test_a_benchmark_that_is_not_complete_is_compared_by_what_it_has() -> None:
     results += [result("theirs", seed, 2.0) for seed in range(2)]
     results += [result("ours", 0, 1.0, "Acrobot-v1"), result("theirs", 0, 2.0, "Acrobot-v1")]
     # Of "ours" over both environments: seed 0, with 1 in each.
-    assert "| ours | 2 x 1 | 1 [1, 1] | - | - |" in overall_table(results)
+    assert "| ours | 2 x 1 | 1 | - | - |" in overall_table(results)
     # Seed 0 only, of both environments: ours is worse in each. Seed 1, better, does not count.
-    assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
+    assert "| ours | theirs | 0 |" in improvement_table(results)
     # An environment that only one of them has leaves the others as they are.
     results += [result("ours", 7, 9.0, "CartPole-v1"), result("alone", 0, 9.0, "CartPole-v1")]
-    assert "| ours | theirs | 0 [0, 0] |" in improvement_table(results)
+    assert "| ours | theirs | 0 |" in improvement_table(results)
     assert "| alone | theirs |" not in improvement_table(results)
     assert "| theirs | 0 x 0 | - | - | - |" in overall_table(results)
 
