@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecVideoRecorder
 
 import sb3_policyflow
 from sb3_policyflow.envs.drawing import GOAL_COLOURS, Canvas
@@ -224,6 +224,17 @@ def test_options_are_used_once_and_may_differ():
     assert not np.isin(env.reset()[:, :2], [1, 2, 3, 4]).any()
 
 
+@pytest.mark.parametrize(
+    "second", [{}, {"velocity": (1.0, 1.0)}, {"position": (0.0, 0.0), "velocity": (1.0, 1.0)}]
+)
+def test_options_that_are_not_alike_are_refused(second):
+    for options in ([{"position": (1.0, 2.0)}, second], [second, {"position": (1.0, 2.0)}]):
+        env = MultiGoalVecEnv(2, seed=0)
+        env.set_options(options)
+        with pytest.raises(ValueError, match="same keys for all environments, not"):
+            env.reset()
+
+
 def test_state_round_trip_repeats_the_future():
     env = MultiGoalVecEnv(8, seed=0)
     env.reset()
@@ -281,10 +292,11 @@ def test_registering_twice_is_silent():
 def test_registering_imports_neither_torch_nor_mujoco():
     code = (
         "import sys, gymnasium, importlib.util as u;"
+        # The package without what it imports itself.
         "spec = u.find_spec('sb3_policyflow');"
-        "path = spec.submodule_search_locations[0] + '/envs/__init__.py';"
-        "s = u.spec_from_file_location('envs', path); m = u.module_from_spec(s);"
-        "s.loader.exec_module(m); m.register(); assert 'MultiGoal-v0' in gymnasium.registry;"
+        "sys.modules['sb3_policyflow'] = u.module_from_spec(spec);"
+        "import sb3_policyflow.envs as envs;"
+        "envs.register(); assert 'MultiGoal-v0' in gymnasium.registry;"
         "assert not {'torch', 'mujoco', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -337,6 +349,14 @@ def test_vec_env_tiles_its_pictures():
     env = MultiGoalVecEnv(4, seed=0, render_mode="rgb_array")
     env.reset()
     assert env.render().shape == (2 * FRAME_SIZE, 2 * FRAME_SIZE, 3)
+
+
+def test_videos_have_the_speed_of_the_environment(tmp_path):
+    env = MultiGoalVecEnv(2, seed=0, render_mode="rgb_array")
+    recorder = VecVideoRecorder(env, str(tmp_path), lambda step: False)
+    assert recorder.frames_per_sec == MultiGoalEnv.metadata["render_fps"] != 30
+    # SB3's own, which shows pictures with OpenCV.
+    assert env.metadata["render_modes"] == ["human", "rgb_array"]
 
 
 # The adapter on other vector environments

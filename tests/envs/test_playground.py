@@ -21,9 +21,12 @@ from sb3_policyflow.envs.vector import GymVectorVecEnv
 pytest.importorskip("mujoco_playground", reason="playground is not installed")
 
 import jax
+import jax.numpy
 from mujoco_playground import dm_control_suite, registry
 from mujoco_playground._src.dm_control_suite import cartpole
 from mujoco_playground._src.mjx_env import MENAGERIE_PATH
+
+from sb3_policyflow.envs.playground_batch import all_tasks, task_config
 
 N_ENVS, LIMIT = 4, 5
 CARTPOLE = "CartpoleBalance"
@@ -238,8 +241,74 @@ def test_the_task_settings_can_be_changed():
         np.testing.assert_allclose(observation, expected, rtol=1e-4, atol=1e-5)
         assert reward == pytest.approx(first_reward + second_reward, rel=1e-5)
         assert truncated == (step == 2)
-    with pytest.raises(ValueError, match=r"no setting 'sim_td'.*sim_dt"):
+    with pytest.raises(ValueError, match=r"no setting 'sim_td'.*: it has .*sim_dt"):
         PlaygroundEnv(CARTPOLE, config_overrides={"sim_td": 0.1})
+
+
+ROBOT = "Go1JoystickFlatTerrain"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"reward_config.scales.tracking_lin_vel": 9.0},
+        {"reward_config": {"scales": {"tracking_lin_vel": 9.0}}},
+    ],
+)
+def test_settings_within_settings_can_be_changed(overrides):
+    before = task_config(ROBOT, {}).to_dict()
+    after = task_config(ROBOT, overrides).to_dict()
+    before["reward_config"]["scales"]["tracking_lin_vel"] = 9.0
+    assert after == before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"reward_config.scales.speed": 1}, "reward_config.scales has .*tracking_lin_vel"),
+        (
+            {"reward_config": {"scalse": {"speed": 1}}},
+            "'reward_config.scalse.speed'.*reward_config",
+        ),
+        ({"sim_dt.speed": 1}, "sim_dt has no settings in it"),
+    ],
+)
+def test_settings_that_there_are_not_are_refused(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        task_config(ROBOT, overrides)
+
+
+class EndsAtOnce(cartpole.Balance):
+    """A task whose episodes end with their first step, which pays 1, as each later one would."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(reward=jax.numpy.ones(()), done=jax.numpy.ones(()))
+
+
+def test_a_task_that_ends_within_repeated_actions_stops_there():
+    def make(**kwargs):
+        return EndsAtOnce(swing_up=False, sparse=False, **kwargs)
+
+    dm_control_suite.register_environment("EndsAtOnce", make, cartpole.default_config)
+    once = PlaygroundVectorEnv("EndsAtOnce", 2)
+    thrice = PlaygroundVectorEnv("EndsAtOnce", 2, config_overrides={"action_repeat": 3})
+    for env in (once, thrice):
+        env.reset(seed=0)
+    expected, found = (env.step(np.ones((2, 1))) for env in (once, thrice))
+    assert found[1].tolist() == [1.0, 1.0]
+    assert found[2].all()
+    for theirs, ours in zip(expected[4]["final_obs"], found[4]["final_obs"], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_a_file_that_a_users_task_lacks_is_not_blamed_on_the_robots():
+    def make(**kwargs):
+        raise FileNotFoundError(2, "No such file", "my_robot.xml")
+
+    dm_control_suite.register_environment("NoFile", make, cartpole.default_config)
+    with pytest.raises(FileNotFoundError, match=r"my_robot\.xml"):
+        PlaygroundEnv("NoFile")
 
 
 def test_bad_input_is_refused(cartpoles):
@@ -273,11 +342,19 @@ def test_an_old_version_is_named_in_one_sentence(monkeypatch):
         PlaygroundEnv(CARTPOLE)
 
 
-def test_any_other_task_is_registered_on_request():
-    env_id = "Playground/PendulumSwingup-v0"
-    ensure_registered(env_id)
-    ensure_registered(env_id)
-    assert gym.make(env_id).observation_space.shape == (3,)
+def test_every_other_task_is_registered():
+    assert {f"Playground/{task}-v0" for task in all_tasks()} <= set(gym.registry)
+    assert gym.make("Playground/PendulumSwingup-v0").observation_space.shape == (3,)
+
+
+def test_a_task_that_was_added_is_registered_on_request():
+    def make(**kwargs):
+        return cartpole.Balance(swing_up=False, sparse=False, **kwargs)
+
+    dm_control_suite.register_environment("Added", make, cartpole.default_config)
+    for _ in range(2):
+        ensure_registered("Playground/Added-v0")
+    assert gym.make("Playground/Added-v0").observation_space.shape == (5,)
 
 
 class TwoSenses(cartpole.Balance):

@@ -134,6 +134,17 @@ def test_cells_must_be_free_and_different(kwargs):
         PointMazeMultiGoalEnv(**kwargs)
 
 
+def test_cells_may_be_lists_as_in_a_yaml_file():
+    env = PointMazeMultiGoalEnv(start_cell=[1, 2], goal_cells=[[2, 6], [5, 1]])
+    np.testing.assert_array_equal(env.start, [-1.5, 2.5])
+    np.testing.assert_array_equal(env.goals, [[2.5, 1.5], [-2.5, -1.5]])
+
+
+def test_reset_options_are_refused():
+    with pytest.raises(ValueError, match=r"no options .*reset_cell.* takes start_cell"):
+        PointMazeMultiGoalEnv().reset(options={"reset_cell": [2, 6]})
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_environment_checkers_pass():
     gymnasium_check_env(gym.make(ENV_ID, render_mode="rgb_array").unwrapped)

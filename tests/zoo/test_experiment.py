@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 import sb3_policyflow  # noqa: F401  # registers
@@ -16,6 +17,7 @@ from sb3_policyflow.envs import PLAYGROUND_TASKS
 from sb3_policyflow.envs.multigoal import MultiGoalVectorEnv
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 from sb3_policyflow.zoo.experiment import choose_config, hyperparams_folder
+from sb3_policyflow.zoo.vector import make_native_vec_env
 
 if importlib.util.find_spec("rl_zoo3") is None:
     pytest.skip("rl_zoo3 is not installed", allow_module_level=True)
@@ -164,6 +166,18 @@ def test_when_native_vectorisation_is_used(
     env = manager(tmp_path, algo, env_id, **options).create_envs(2)
     assert type(env) is expected
     assert env.num_envs == 2
+    env.close()
+
+
+def test_a_picture_for_people_is_left_to_gymnasium(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It puts a wrapper around each environment."""
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    human = {"render_mode": "human"}
+    with pytest.warns(UserWarning, match="HumanRendering"):
+        env = make_vec_env("MultiGoal-v0", 2, vec_env_cls=make_native_vec_env, env_kwargs=human)  # type: ignore[arg-type]
+    assert type(env) is DummyVecEnv
+    assert env.reset().shape == (2, 4)
     env.close()
 
 
