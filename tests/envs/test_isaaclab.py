@@ -29,6 +29,7 @@ from sb3_policyflow.envs.isaaclab.train import main, make_parser, read_agent, tr
 FAKES = Path(__file__).parent / "fake_isaaclab"
 TASKS = {"two": "Isaac-Velocity-Flat-Anymal-D-v0", "three": "Isaac-Velocity-Flat-AnymalD"}
 EACH = pytest.mark.parametrize("version", TASKS)
+THREE = pytest.mark.parametrize("version", ["three"])
 SMALL = ["agent.n_steps=8", "agent.n_flow_steps=2", "--num_envs", "16"]
 
 
@@ -86,8 +87,8 @@ def assert_refused(arguments: list[str], *parts: str) -> None:
 @EACH
 def test_trains_and_goes_on(version: str, tmp_path: Path) -> None:
     task = TASKS[version]
-    common = ("--task", task, *SMALL, "--max_iterations", "4", "--save_interval", "2", "--headless")
-    said = run_script(version, tmp_path, *common, "--seed", "7")
+    common = ("--task", task, "--num_envs", "16", "--max_iterations", "4", "--headless")
+    said = run_script(version, tmp_path, *common, *SMALL, "--save_interval", "2", "--seed", "7")
     assert "ep_rew_mean" in said
     assert said.count("environment closed") == said.count("simulation closed") == 1
     (folder,) = (tmp_path / "logs" / "sb3_policyflow" / task).iterdir()
@@ -97,18 +98,17 @@ def test_trains_and_goes_on(version: str, tmp_path: Path) -> None:
     assert (model.seed, model.n_envs, model.num_timesteps) == (7, 16, 512)
     assert (model.batch_size, model.clip_range_vf(1.0), model.n_flow_steps) == (32, 0.2, 2)
     assert model.policy.activation_fn is th.nn.ELU
-    run_script(version, tmp_path, *common, "--checkpoint", f"{folder}/model.zip", "--log_dir", "on")
-    assert PolicyFlow.load(tmp_path / "on" / "model.zip").num_timesteps == 1024
+    run_script(version, tmp_path, *common, "--checkpoint", f"{folder}/model", "--log_dir", "on")
+    model = PolicyFlow.load(tmp_path / "on" / "model.zip")
+    assert (model.seed, model.n_steps, model.num_timesteps) == (7, 8, 1024)
 
 
 @EACH
 @pytest.mark.usefixtures("installed")
 def test_normalisation_is_that_of_isaaclabs_files(version: str) -> None:
-    common = [
-        *("--task", TASKS[version], *SMALL, "--max_iterations", "2", "--log_dir", "out"),
-        *("agent.normalize_input=1", "agent.clip_obs=5"),
-    ]
-    main(common)
+    common = ["--task", TASKS[version], "--num_envs", "16", "--max_iterations", "2"]
+    common += ["--log_dir", "out"]
+    main([*common, *SMALL, "agent.normalize_input=1", "agent.clip_obs=5"])
     statistics = Path("out", "model_vecnormalize.pkl")
     first: Any = pickle.loads(statistics.read_bytes())
     forget_isaaclab()
@@ -117,12 +117,60 @@ def test_normalisation_is_that_of_isaaclabs_files(version: str) -> None:
     assert (first.clip_obs, first.norm_reward) == (5, False)
     # Statistics count the first observations, and go on from those of the file.
     assert (first.obs_rms.count, second.obs_rms.count) == pytest.approx((17 * 16, 34 * 16))
-    statistics.unlink()
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
+def test_lost_statistics_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = {**presets.flat_anymal_d(), "n_steps": 8, "normalize_input": True}
+    monkeypatch.setattr(presets, "flat_anymal_d", lambda: preset)
+    common = ["--task", TASKS["three"], "--num_envs", "16", "--max_iterations", "1"]
+    main([*common, "--log_dir", "out"])
+    Path("out", "model_vecnormalize.pkl").unlink()
     forget_isaaclab()
     assert_refused(
         [*common, "--checkpoint", "out/model.zip"],
         "their statistics are not at out/model_vecnormalize.pkl",
     )
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
+def test_what_a_model_brings_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not the preset's: rollouts, what time limits are bootstrapped from, normalisation."""
+    made = []
+    monkeypatch.setattr(
+        "sb3_policyflow.envs.isaaclab.train.wrap",
+        lambda env, bounds: made.append(env.unwrapped.cfg) or lab.wrap(env, bounds),
+    )
+    common = ["--task", TASKS["three"], "--num_envs", "16", "--max_iterations", "2"]
+    other = ["agent.timeout_bootstrap=terminal", "agent.normalize_value=1"]
+    main([*common, *SMALL, *other, "--log_dir", "out"])
+    forget_isaaclab()
+    main([*common, "--checkpoint", "out/model.zip", "--seed", "9", "--log_dir", "on"])
+    model = PolicyFlow.load("on/model.zip")
+    assert (model.num_timesteps, model.timeout_bootstrap) == (2 * 2 * 8 * 16, "terminal")
+    assert [(config.compute_final_obs, config.seed) for config in made] == [(True, 42), (True, 9)]
+    assert model.seed == 9
+    assert pickle.loads(Path("on", "model_vecnormalize.pkl").read_bytes()).norm_reward
+
+
+@EACH
+@pytest.mark.usefixtures("installed")
+def test_what_cannot_be_gone_on_from_is_said_before_the_simulator_starts(
+    version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Both versions see whether the task is there when they start.
+    monkeypatch.setattr(lab, "check_task", lambda task, agent: pytest.fail("has started"))
+    common = ["--task", TASKS[version], "--num_envs", "16", "--max_iterations", "1", "--checkpoint"]
+    assert_refused([*common, "no/model.zip"], "There is no model no/model.zip")
+    Path("empty.zip").touch()
+    assert_refused([*common, "empty.zip"], "empty.zip cannot be gone on from: ")
+    PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("model.zip")
+    changes = ["agent.gamma=0.9", "env.x=1", "agent.n_timesteps=9"]
+    assert_refused([*common, "model.zip", *changes], "leave out agent.gamma=0.9, or --checkpoint")
+    with pytest.raises(pytest.fail.Exception, match="has started"):
+        main([*common, "model.zip", *changes[1:]])
 
 
 @pytest.mark.parametrize("version", [None])
@@ -258,9 +306,6 @@ def wrapped(n_envs: int = 4, final: bool = False, **options: Any) -> Any:
     lab.prepare_timeouts(config, "terminal" if final else "current")
     env = gym.make(TASKS["three"], cfg=config)
     return lab.wrap(env, options.get("bounds", (-100.0, 100.0)))
-
-
-THREE = pytest.mark.parametrize("version", ["three"])
 
 
 @THREE

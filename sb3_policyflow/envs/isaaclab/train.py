@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,11 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
+from sb3_policyflow.envs.isaaclab.checkpoint import (
+    find_checkpoint,
+    read_checkpoint,
+    statistics_of,
+)
 from sb3_policyflow.envs.isaaclab.lab import (
     Configured,
     Lab,
@@ -39,8 +43,12 @@ def main(arguments: list[str]) -> int:
         lab = _find_lab_unless_asked_for_help(parser, arguments)
         lab.add_arguments(parser)
         options, overrides = parser.parse_known_args(arguments)
+        saved: dict[str, Any] = {}
+        if options.checkpoint is not None:
+            options.checkpoint = find_checkpoint(options.checkpoint)
+            saved = read_checkpoint(options.checkpoint, overrides)
         with lab.launched(options, overrides) as configured:
-            run(configured, options)
+            run(Configured(configured.env, configured.agent | saved), options)
     except LabError as error:
         raise SystemExit(str(error)) from error
     return 0
@@ -65,7 +73,9 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--num_envs", type=int, help="environments; the task's own number if not given"
     )
-    parser.add_argument("--seed", type=int, help="seed; the hyperparameters' own if not given")
+    parser.add_argument(
+        "--seed", type=int, help="seed; that of the hyperparameters or the model if not given"
+    )
     parser.add_argument("--max_iterations", type=int, help="updates, instead of agent.n_timesteps")
     parser.add_argument(
         "--agent", default=AGENT_KEY, help="key of the hyperparameters in the registry"
@@ -170,7 +180,9 @@ def train(
             agent.pop("policy"), env, verbose=1, tensorboard_log=str(folder), **agent
         )
     else:
-        model = PolicyFlow.load(options.checkpoint, env=env, tensorboard_log=str(folder))
+        # A seed starts the random generators anew; without one they go on.
+        seed = {} if options.seed is None else {"seed": options.seed}
+        model = PolicyFlow.load(options.checkpoint, env=env, tensorboard_log=str(folder), **seed)
     callback = RolloutCheckpointCallback(
         options.save_interval * model.n_steps,
         str(folder),
@@ -188,7 +200,7 @@ def train(
 def normalized(
     env: VecEnv, options: dict[str, Any], gamma: float, checkpoint: Path | None
 ) -> VecEnv:
-    """Put ``VecNormalize`` around an environment, if its hyperparameters ask for it.
+    """Put ``VecNormalize`` around an environment, if its hyperparameters or statistics ask for it.
 
     :param env: The environment.
     :param options: See :data:`NORMALIZATION`.
@@ -196,16 +208,16 @@ def normalized(
     :param checkpoint: A model to go on from, with whose statistics to start.
     :raises LabError: If these are missing.
     """
+    statistics = None if checkpoint is None else statistics_of(checkpoint)
+    if statistics is not None and statistics.is_file():
+        return VecNormalize.load(str(statistics), env)
     if not (options.get("normalize_input") or options.get("normalize_value")):
         return env
-    if checkpoint is not None:
-        statistics = statistics_of(checkpoint)
-        if not statistics.is_file():
-            raise LabError(
-                f"{checkpoint} was trained on normalised observations, but their statistics are "
-                f"not at {statistics}: copy them there."
-            )
-        return VecNormalize.load(str(statistics), env)
+    if statistics is not None:
+        raise LabError(
+            f"{checkpoint} was trained on normalised observations, but their statistics are "
+            f"not at {statistics}: copy them there."
+        )
     return VecNormalize(
         env,
         norm_obs=options.get("normalize_input", False),
@@ -214,15 +226,3 @@ def normalized(
         clip_reward=np.inf,
         gamma=gamma,
     )
-
-
-def statistics_of(checkpoint: Path) -> Path:
-    """Where the statistics of ``VecNormalize`` are that were saved with a model.
-
-    >>> statistics_of(Path("logs/model_98304_steps.zip")).name
-    'model_vecnormalize_98304_steps.pkl'
-    >>> statistics_of(Path("logs/model.zip")).name
-    'model_vecnormalize.pkl'
-    """
-    name = re.sub(r"(_\d+_steps)?$", r"_vecnormalize\1", checkpoint.stem, count=1)
-    return checkpoint.with_name(f"{name}.pkl")
