@@ -84,7 +84,8 @@ class ActionModule(nn.Module):
 
         :param observations: As the environment gives them, images with their channels first: a
             tensor (n, ...), or a dictionary of them.
-        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
+        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given. A
+            PolicyFlow's are of standard deviation ``latent_std``.
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalised(observations))

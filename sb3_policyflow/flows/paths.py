@@ -81,11 +81,15 @@ class Path(ABC):
         old_velocity: th.Tensor,
         points: th.Tensor,
         times: th.Tensor,
+        latent_std: float = 1.0,
     ) -> th.Tensor:
         """How far a velocity is from minus the score of the reference flow (paper, eta_t).
 
         eta = c(t) (v + grad log p_t), with the score taken from the reference velocity:
         eta = c(t) v - (b(t) x_t - a(t) v_old),    c score = a v_old - b x_t
+
+        Latents of standard deviation s have a v_old - b x_t = c s^2 score on paths without noise of
+        their own, since the score is -E[z | x_t] over s^2 and the coefficient of z.
 
         >>> t, x, v = th.tensor([0.25]), th.tensor([[2.0]]), th.tensor([[4.0]])
         >>> Rectified().brownian_residual(v, v, x, t).item()  # 0.75 * 4 - (2 - 0.25 * 4)
@@ -95,10 +99,11 @@ class Path(ABC):
         :param old_velocity: v_old, the reference velocity at the same points, shape (..., dim).
         :param points: x_t, shape (..., dim).
         :param times: t, shape (...).
+        :param latent_std: s, of z ~ N(0, s^2); 1 for stochastic paths.
         :return: eta, shape (..., dim).
         """
         score, slope, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))
-        return score * velocity - (point * points - slope * old_velocity)
+        return score * velocity - (point * points - slope * old_velocity) / latent_std**2
 
     def _combine(
         self,

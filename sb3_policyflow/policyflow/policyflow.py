@@ -206,7 +206,9 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         self._uniform: UniformTargets | None = None
         if self.uniform_noise_coef != 0.0:
             assert isinstance(self.action_space, spaces.Box)
-            self._uniform = UniformTargets(self.action_space, self.policy.path)
+            self._uniform = UniformTargets(
+                self.action_space, self.policy.path, self.policy.latent_std
+            )
 
     def _excluded_save_params(self) -> list[str]:
         derived = ["_brownian_schedule", "_uniform_schedule", "_uniform", "_times"]
@@ -272,7 +274,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     def _brownian_loss(self, probes: Probes, velocity: th.Tensor) -> th.Tensor:
         """Mean over samples of ||eta||^2 (paper, J^Reg)."""
         eta = self.policy.path.brownian_residual(
-            velocity, probes.old_velocity, probes.points, probes.times
+            velocity, probes.old_velocity, probes.points, probes.times, self.policy.latent_std
         )
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)

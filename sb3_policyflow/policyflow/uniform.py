@@ -9,7 +9,7 @@ from sb3_policyflow.flows import Path, VelocityField
 class UniformTargets:
     """Pulls a flow towards the uniform distribution over the actions.
 
-    E ||v(x_t, t, s) - dx_t/dt||^2,    x_t between z ~ N(0, I) and u ~ U(actions),  t ~ U(0, T)
+    E ||v(x_t, t, s) - dx_t/dt||^2,    x_t between a latent z and u ~ U(actions),  t ~ U(0, T)
 
     The diffusion entropy regularisation of Ding et al. (2024), "Diffusion-based Reinforcement
     Learning via Q-weighted Variational Policy Optimization", https://arxiv.org/abs/2405.16173,
@@ -17,16 +17,18 @@ class UniformTargets:
 
     :param action_space: The actions; SB3 takes bounded ones only.
     :param path: The interpolation path.
+    :param latent_std: Standard deviation of the latents.
     :raises ValueError: If the path draws noise of its own.
     """
 
-    def __init__(self, action_space: spaces.Box, path: Path) -> None:
+    def __init__(self, action_space: spaces.Box, path: Path, latent_std: float = 1.0) -> None:
         if path.stochastic:
             raise ValueError(
                 "uniform_noise_coef needs a path without noise of its own: use path='rectified' "
                 "or path='trigflow'."
             )
         self._path = path
+        self._latent_std = latent_std
         self._low = th.as_tensor(action_space.low).flatten()
         self._high = th.as_tensor(action_space.high).flatten()
 
@@ -39,7 +41,7 @@ class UniformTargets:
         """
         low, high = self._low.to(features), self._high.to(features)
         uniform = low + (high - low) * features.new_empty(len(features), len(low)).uniform_()
-        latents = th.randn_like(uniform)
+        latents = self._latent_std * th.randn_like(uniform)
         times = self._path.end_time * features.new_empty(len(features)).uniform_()
         points = self._path.interpolate(latents, uniform, times)
         target = self._path.derivative(latents, uniform, times)

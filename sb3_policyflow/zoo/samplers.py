@@ -49,6 +49,8 @@ def sample_policyflow_params(
         "solver": trial.suggest_categorical("solver", ["midpoint", "euler", "heun", "ab2"]),
         "log_std_init": trial.suggest_float("log_std_init", -2.5, 0.5),
     }
+    if params["path"] != "stochastic":
+        params["latent_std"] = trial.suggest_float("latent_std", 0.1, 1.0, log=True)
     return finish_sample(trial, params)
 
 
@@ -161,8 +163,9 @@ def convert_flow_params(params: dict[str, Any]) -> dict[str, Any]:
         "activation_fn": ACTIVATIONS[hyperparams.pop("activation_fn")],
         "embedding_dim": hyperparams.pop("embedding_dim"),
     }
-    if "log_std_init" in hyperparams:
-        policy_kwargs["log_std_init"] = hyperparams.pop("log_std_init")
+    for name in ("log_std_init", "latent_std"):
+        if name in hyperparams:
+            policy_kwargs[name] = hyperparams.pop(name)
     return {**hyperparams, "policy_kwargs": policy_kwargs}
 
 

@@ -61,16 +61,16 @@ def test_stochastic_path_has_the_spread_of_the_table() -> None:
 
 
 def gaussian_velocity_and_score(
-    path: Path, times: th.Tensor, x: th.Tensor, mean: float, std: float
+    path: Path, times: th.Tensor, x: th.Tensor, mean: float, std: float, latent_std: float = 1.0
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Velocity and score of x_t when z ~ N(0, 1) and phi ~ N(mean, std^2) are independent.
+    """Velocity and score of x_t when z ~ N(0, latent_std^2), phi ~ N(mean, std^2) are independent.
 
     x_t and dx_t/dt are jointly Gaussian: v(x) = E[dx_t/dt | x_t = x] is linear regression.
     """
     a, b, c = (k.unsqueeze(-1) for k in path.coefficients(times))
     da, db, dc = (k.unsqueeze(-1) for k in path.derivative_coefficients(times))
-    variance = a**2 + (b * std) ** 2 + c**2
-    covariance = da * a + db * b * std**2 + dc * c
+    variance = (a * latent_std) ** 2 + (b * std) ** 2 + c**2
+    covariance = da * a * latent_std**2 + db * b * std**2 + dc * c
     deviation = x - b * mean
     return db * mean + covariance / variance * deviation, -deviation / variance
 
@@ -105,6 +105,18 @@ def test_brownian_residual_is_its_coefficient_times_velocity_plus_score(name: st
     old_velocity, score = gaussian_velocity_and_score(path, times, x, mean=-0.4, std=0.5)
     velocity = th.randn(9, 2, dtype=th.float64)
     eta = path.brownian_residual(velocity, old_velocity, x, times)
+    coefficient = path.score_coefficients(times).score.unsqueeze(-1)
+    th.testing.assert_close(eta, coefficient * (velocity + score))
+
+
+@pytest.mark.parametrize("name", ["rectified", "trigflow"])
+@pytest.mark.parametrize("latent_std", [0.1, 0.5, 2.0])
+def test_brownian_residual_with_narrower_and_wider_latents(name: str, latent_std: float) -> None:
+    path = PATHS[name]()
+    times, x = interior_times(path), th.randn(9, 2, dtype=th.float64)
+    old_velocity, score = gaussian_velocity_and_score(path, times, x, -0.4, 0.5, latent_std)
+    velocity = th.randn(9, 2, dtype=th.float64)
+    eta = path.brownian_residual(velocity, old_velocity, x, times, latent_std)
     coefficient = path.score_coefficients(times).score.unsqueeze(-1)
     th.testing.assert_close(eta, coefficient * (velocity + score))
 

@@ -61,17 +61,18 @@ def test_gaussian_mode_has_no_flow_to_spread() -> None:
             PolicyFlow("MlpPolicy", "Pendulum-v1", **GAUSSIAN, **{option: 0.1})
 
 
-def test_uniform_targets_make_actions_uniform() -> None:
+@pytest.mark.parametrize("latent_std", [1.0, 0.4])
+def test_uniform_targets_make_actions_uniform(latent_std: float) -> None:
     """A field trained on nothing else carries its latents to the uniform distribution."""
     box, features = spaces.Box(np.float32([-1, 2]), np.float32([3, 6])), 1
     field = VelocityField(2, features, net_arch=[64, 64])
-    targets = UniformTargets(box, Rectified())
+    targets = UniformTargets(box, Rectified(), latent_std)
     optimizer = th.optim.Adam(field.parameters(), lr=3e-3)
     for _ in range(400):
         optimizer.zero_grad()
         targets.loss(field, th.zeros(256, features)).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-    points = th.randn(2000, 2)
+    points = latent_std * th.randn(2000, 2)
     with th.no_grad():
         for step in range(20):
             points = points + field(points, th.tensor(step / 20), th.zeros(features)) / 20

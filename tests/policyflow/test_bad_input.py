@@ -45,6 +45,15 @@ def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
         ({"target_kl": -1.0}, r"target_kl must be positive"),
         ({"n_epochs": 2.5}, r"n_epochs must be at least 1, and a whole number"),
         ({"policy_kwargs": {"log_std_bounds": (2.0, -5.0)}}, r"log_std_bounds must be two numbers"),
+        ({"policy_kwargs": {"latent_std": 0.0}}, r"latent_std must be positive, got 0.0"),
+        (
+            {"policy_kwargs": {"latent_std": 0.5}, "path": "stochastic"},
+            r"leave out latent_std, or use path='rectified'",
+        ),
+        (
+            {"policy_kwargs": {"latent_std": 0.5}, "gaussian": True},
+            r"latents are 0: leave out latent_std",
+        ),
         ({"lr_adaptation": "step"}, r"lr_adaptation must be one of 'epoch', 'minibatch'"),
         ({"kl_window": "all"}, r"kl_window must be one of 'epoch', 'update'"),
         ({"advantage_scope": "all"}, r"advantage_scope must be one of 'minibatch', 'rollout'"),

@@ -188,6 +188,28 @@ def test_brownian_loss_by_hand() -> None:
     assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 2.0
 
 
+def test_brownian_loss_by_hand_with_narrower_latents() -> None:
+    """With s = 1/2: eta = v / 2 - 4 (x - v_old / 2) = (4, 1) - 4 (2, 1) = (-4, -3)."""
+    model = tiny_model(policy_kwargs={"latent_std": 0.5})
+    probes = Probes(
+        times=th.tensor([[0.5]]),
+        points=th.tensor([[[3.0, 1.0]]]),
+        old_velocity=th.tensor([[[2.0, 0.0]]]),
+    )
+    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 25.0
+
+
+def test_latents_have_their_standard_deviation() -> None:
+    policy = tiny_model(policy_kwargs={"latent_std": 0.2}).policy
+    features = th.zeros(20_000, 3, dtype=th.float64)
+    with th.no_grad():
+        _, record = policy.sample_actions(features)
+        assert record.latents.std().item() == pytest.approx(0.2, rel=0.03)
+        th.testing.assert_close(record.endpoints, policy.carry(record.latents, features))
+        _, record = policy.sample_actions(features, deterministic=True)
+    assert not record.latents.any()
+
+
 def test_approximate_ratio_approaches_the_exact_one_for_small_updates() -> None:
     """The error of the shift is of first order in the update (paper, error analysis)."""
     errors = []

@@ -160,7 +160,7 @@ def test_saved_model_acts_and_goes_on_as_before(tmp_path: Path) -> None:
         path="trigflow",
         n_flow_steps=4,
         solver="rk4",
-        policy_kwargs={"embedding_dim": 8, "log_std_bounds": (-5.0, 2.0)},
+        policy_kwargs={"embedding_dim": 8, "log_std_bounds": (-5.0, 2.0), "latent_std": 0.5},
     )
     model.learn(256)
     assert model.adaptive_learning_rate != 3e-4
@@ -170,6 +170,7 @@ def test_saved_model_acts_and_goes_on_as_before(tmp_path: Path) -> None:
     assert loaded.policy.optimizer.param_groups[0]["lr"] == model.adaptive_learning_rate
     assert loaded.brownian_coef == "lin_0.25_0.05"
     assert loaded.policy.n_flow_steps == 4
+    assert loaded.policy.latent_std == 0.5
     obs = env.reset()
     np.testing.assert_array_equal(
         loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0]

@@ -196,6 +196,8 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
         for name in ("brownian_coef", "uniform_noise_coef"):
             options.pop(name, None)
     options["policy_kwargs"] = draw(networks)
+    if algorithm is PolicyFlow and not ("gaussian" in options or "path" in options):
+        options["policy_kwargs"]["latent_std"] = draw(st.sampled_from([0.1, 1.0, 3.0]))
     options["n_steps"], options["n_epochs"] = n_steps, draw(st.integers(1, 2))
     options["batch_size"] = draw(st.integers(2, n_steps * n_envs))
     environment = {

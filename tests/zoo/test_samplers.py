@@ -63,6 +63,10 @@ def test_every_choice_is_drawn_and_reaches_the_policy() -> None:
     assert {params["path"] for params in drawn} == {"rectified", "stochastic", "trigflow"}
     assert {params["solver"] for params in drawn} == {"euler", "midpoint", "heun", "ab2"}
     assert {params["desired_kl"] for params in drawn} == {None, 0.005, 0.01, 0.02}
+    spread = [params["policy_kwargs"].get("latent_std") for params in drawn]  # type: ignore[attr-defined]
+    stochastic = [params["path"] == "stochastic" for params in drawn]
+    assert [std is None for std in spread] == stochastic
+    assert all(0.1 <= std <= 1 for std in spread if std is not None)
     model = PolicyFlow("MlpPolicy", env, **drawn[0])
     assert model.policy.solver == drawn[0]["solver"]
     assert model.policy.n_flow_steps == drawn[0]["n_flow_steps"]
