@@ -37,4 +37,4 @@ def test_pointmaze() -> None:
 @pytest.mark.parametrize("task", playground.TASKS)
 def test_playground(task: str) -> None:
     env = f"Playground/{task}-v0"
-    assert n_done("playground", playground.PANELS, 5, 3_000_000, env=env) == 12
+    assert n_done("playground", playground.PANELS, 5, 3_000_000, env=env) == 15
