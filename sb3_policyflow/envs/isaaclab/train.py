@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
             options.checkpoint = find_checkpoint(options.checkpoint)
             saved = read_checkpoint(options.checkpoint, overrides)
         with lab.launched(options, overrides) as configured:
-            run(Configured(configured.env, configured.agent | saved), options)
+            run(Configured(configured.env, {**configured.agent, **saved}), options)
     except LabError as error:
         raise SystemExit(str(error)) from error
     return 0
