@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -24,6 +25,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.envs.isaaclab import lab, presets
+from sb3_policyflow.envs.isaaclab.checkpoint import read_checkpoint
 from sb3_policyflow.envs.isaaclab.train import main, make_parser, read_agent, train
 
 FAKES = Path(__file__).parent / "fake_isaaclab"
@@ -119,19 +121,52 @@ def test_normalisation_is_that_of_isaaclabs_files(version: str) -> None:
     assert (first.obs_rms.count, second.obs_rms.count) == pytest.approx((17 * 16, 34 * 16))
 
 
+@EACH
+@pytest.mark.usefixtures("installed")
+def test_lost_statistics_are_missed_before_the_simulator_starts(
+    version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model tells, even if the preset knows of no normalisation."""
+    common = ["--task", TASKS[version], "--num_envs", "16", "--max_iterations", "1"]
+    main([*common, *SMALL, "agent.normalize_value=1", "--log_dir", "out"])
+    statistics = Path("out", "model_vecnormalize.pkl")
+    statistics.write_bytes(statistics.read_bytes()[:9])
+    monkeypatch.setattr(lab, "check_task", lambda task, agent: pytest.fail("has started"))
+    resumed = [*common, "--checkpoint", "out/model.zip"]
+    assert_refused(resumed, f"{statistics} cannot be gone on from: ")
+    statistics.write_bytes(pickle.dumps({}))
+    assert_refused(resumed, f"{statistics} does not hold statistics of VecNormalize")
+    statistics.unlink()
+    assert_refused(
+        resumed, f"trained with VecNormalize, but its statistics are not at {statistics}"
+    )
+
+
 @THREE
 @pytest.mark.usefixtures("installed")
-def test_lost_statistics_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
-    preset = {**presets.flat_anymal_d(), "n_steps": 8, "normalize_input": True}
-    monkeypatch.setattr(presets, "flat_anymal_d", lambda: preset)
+def test_a_model_without_statistics_stays_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the preset says, and whatever an earlier run has left in the folder."""
     common = ["--task", TASKS["three"], "--num_envs", "16", "--max_iterations", "1"]
-    main([*common, "--log_dir", "out"])
-    Path("out", "model_vecnormalize.pkl").unlink()
+    main([*common, *SMALL, "agent.normalize_input=1", "--log_dir", "out"])
     forget_isaaclab()
-    assert_refused(
-        [*common, "--checkpoint", "out/model.zip"],
-        "their statistics are not at out/model_vecnormalize.pkl",
-    )
+    main([*common, *SMALL, "--log_dir", "out"])
+    assert Path("out", "model_vecnormalize.pkl").is_file()
+    preset = {**presets.flat_anymal_d(), "normalize_input": True}
+    monkeypatch.setattr(presets, "flat_anymal_d", lambda: preset)
+    forget_isaaclab()
+    main([*common, "--checkpoint", "out/model.zip", "--log_dir", "on"])
+    assert PolicyFlow.load("on/model.zip").num_timesteps == 2 * 8 * 16
+    assert not Path("on", "model_vecnormalize.pkl").exists()
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
+def test_statistics_of_a_file_that_does_not_tell() -> None:
+    env = VecNormalize(wrapped())
+    PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=8).save("model", exclude=["resume_state"])
+    assert read_checkpoint(Path("model"), []).statistics is None
+    env.save("model_vecnormalize.pkl")
+    assert isinstance(read_checkpoint(Path("model"), []).statistics, VecNormalize)
 
 
 @THREE
@@ -167,6 +202,13 @@ def test_what_cannot_be_gone_on_from_is_said_before_the_simulator_starts(
     Path("empty.zip").touch()
     assert_refused([*common, "empty.zip"], "empty.zip cannot be gone on from: ")
     PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("model.zip")
+    with ZipFile("model.zip") as whole, ZipFile("other.zip", "w") as other:
+        for name in whole.namelist():
+            other.writestr(name, b"{}" if name.endswith(".pth") else whole.read(name))
+    assert_refused([*common, "other.zip"], "other.zip cannot be gone on from: ")
+    FPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("fpo.zip")
+    assert_refused([*common, "fpo.zip"], "fpo.zip cannot be gone on from: ", "not FPOPolicy")
+    assert_refused([*common, "model", "agent=large"], "leave out agent=large, or --checkpoint")
     changes = ["agent.gamma=0.9", "env.x=1", "agent.n_timesteps=9"]
     assert_refused([*common, "model.zip", *changes], "leave out agent.gamma=0.9, or --checkpoint")
     with pytest.raises(pytest.fail.Exception, match="has started"):

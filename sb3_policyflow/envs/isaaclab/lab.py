@@ -184,7 +184,7 @@ def prepare_timeouts(env_config: Any, timeout_bootstrap: str) -> None:
     if not hasattr(env_config, "compute_final_obs"):
         raise LabError(
             "This version of IsaacLab does not tell the last observation of an episode, which "
-            "timeout_bootstrap='terminal' needs: use agent.timeout_bootstrap=current, as the "
-            "presets do, or IsaacLab 3."
+            "timeout_bootstrap='terminal' needs: train with agent.timeout_bootstrap=current, as "
+            "the presets do, or use IsaacLab 3."
         )
     env_config.compute_final_obs = True

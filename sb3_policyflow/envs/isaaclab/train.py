@@ -11,11 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
-from sb3_policyflow.envs.isaaclab.checkpoint import (
-    find_checkpoint,
-    read_checkpoint,
-    statistics_of,
-)
+from sb3_policyflow.envs.isaaclab.checkpoint import Checkpoint, read_checkpoint
 from sb3_policyflow.envs.isaaclab.lab import (
     Configured,
     Lab,
@@ -43,12 +39,10 @@ def main(arguments: list[str]) -> int:
         lab = _find_lab_unless_asked_for_help(parser, arguments)
         lab.add_arguments(parser)
         options, overrides = parser.parse_known_args(arguments)
-        saved: dict[str, Any] = {}
         if options.checkpoint is not None:
-            options.checkpoint = find_checkpoint(options.checkpoint)
-            saved = read_checkpoint(options.checkpoint, overrides)
+            options.checkpoint = read_checkpoint(options.checkpoint, overrides)
         with lab.launched(options, overrides) as configured:
-            run(Configured(configured.env, {**configured.agent, **saved}), options)
+            run(configured, options)
     except LabError as error:
         raise SystemExit(str(error)) from error
     return 0
@@ -104,13 +98,14 @@ def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
     """Make the environment, and train in it.
 
     :param configured: The task, whose configuration is changed in place.
-    :param options: The command line.
+    :param options: The command line, whose checkpoint has been read.
     :return: The trained model.
     """
     config = configured.env
+    saved = {} if options.checkpoint is None else options.checkpoint.hyperparameters
     apply_options(config, options)
     agent, n_timesteps, normalization = read_agent(
-        configured.agent, config.scene.num_envs, options.max_iterations, options.seed
+        {**configured.agent, **saved}, config.scene.num_envs, options.max_iterations, options.seed
     )
     config.seed = agent["seed"]
     prepare_timeouts(config, agent.get("timeout_bootstrap", "terminal"))
@@ -169,7 +164,7 @@ def train(
     :param agent: Arguments of :class:`PolicyFlow`.
     :param n_timesteps: How long.
     :param normalization: See :data:`NORMALIZATION`.
-    :param options: The command line.
+    :param options: The command line, whose checkpoint has been read.
     :return: The trained model.
     """
     moment = time.strftime("%Y-%m-%d_%H-%M-%S")
@@ -182,7 +177,9 @@ def train(
     else:
         # A seed starts the random generators anew; without one they go on.
         seed = {} if options.seed is None else {"seed": options.seed}
-        model = PolicyFlow.load(options.checkpoint, env=env, tensorboard_log=str(folder), **seed)
+        model = PolicyFlow.load(
+            options.checkpoint.path, env=env, tensorboard_log=str(folder), **seed
+        )
     callback = RolloutCheckpointCallback(
         options.save_interval * model.n_steps,
         str(folder),
@@ -198,26 +195,22 @@ def train(
 
 
 def normalized(
-    env: VecEnv, options: dict[str, Any], gamma: float, checkpoint: Path | None
+    env: VecEnv, options: dict[str, Any], gamma: float, checkpoint: Checkpoint | None
 ) -> VecEnv:
-    """Put ``VecNormalize`` around an environment, if its hyperparameters or statistics ask for it.
+    """Put ``VecNormalize`` around an environment, if its hyperparameters or the model ask for it.
 
     :param env: The environment.
     :param options: See :data:`NORMALIZATION`.
     :param gamma: Discount factor, which scales rewards.
-    :param checkpoint: A model to go on from, with whose statistics to start.
-    :raises LabError: If these are missing.
+    :param checkpoint: A model to go on from, as it was trained: whatever the hyperparameters say.
     """
-    statistics = None if checkpoint is None else statistics_of(checkpoint)
-    if statistics is not None and statistics.is_file():
-        return VecNormalize.load(str(statistics), env)
+    if checkpoint is not None:
+        if checkpoint.statistics is None:
+            return env
+        checkpoint.statistics.set_venv(env)
+        return checkpoint.statistics
     if not (options.get("normalize_input") or options.get("normalize_value")):
         return env
-    if statistics is not None:
-        raise LabError(
-            f"{checkpoint} was trained on normalised observations, but their statistics are "
-            f"not at {statistics}: copy them there."
-        )
     return VecNormalize(
         env,
         norm_obs=options.get("normalize_input", False),
