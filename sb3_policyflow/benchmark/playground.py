@@ -27,15 +27,15 @@ TIME = "embedding_dim=8,frequencies=[0.15915494,0.31830989,0.63661977,1.27323954
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "policyflow": {
+        "policy_kwargs": f"dict({NETWORKS})",
+        "learning_rate": "lin_0.003",
+        "clip_range": 0.2,
+    },
+    "policyflow-latent0.3": {
         "policy_kwargs": f"dict({NETWORKS},latent_std=0.3)",
         "learning_rate": "lin_0.003",
         "clip_range": 0.2,
         "brownian_coef": 0.0,
-    },
-    "policyflow-latent1": {
-        "policy_kwargs": f"dict({NETWORKS})",
-        "learning_rate": "lin_0.003",
-        "clip_range": 0.2,
     },
     "fpo": {
         "policy_kwargs": f"dict({NETWORKS},{TIME})",
@@ -50,9 +50,9 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     },
     "ppo": {"policy_kwargs": f"dict({NETWORKS})", "learning_rate": "lin_0.003"},
 }
-"""What differs from the YAML files beside the rollouts: the learning rate, PolicyFlow's latents and
-clip range, and DPPO's noise, chosen on CheetahRun, and FPO's clamp, without which a training became
-infinite (docs/results.md). The second PolicyFlow has the paper's latents."""
+"""What differs from the YAML files beside the rollouts: the learning rate, PolicyFlow's clip range
+and DPPO's noise, chosen on CheetahRun, and FPO's clamp, without which a training became infinite
+(docs/results.md). The second PolicyFlow has narrower latents than the paper's."""
 
 PANELS = {
     name: Panel(name, name.partition("-")[0], ROLLOUTS | hyperparams)
