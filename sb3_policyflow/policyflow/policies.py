@@ -28,8 +28,8 @@ class FlowPolicy(OdeFlowPolicy):
 
     ``latent_std`` is not of the paper, whose latents are of standard deviation 1. What they add to
     an action is noise that the importance ratio does not see, and where actions are bounded by 1 it
-    drowns sigma. With less of it locomotion is learned faster, HalfCheetah several times; tasks whose
-    rewards have to be found first are learned less well (docs/results.md).
+    drowns sigma. With less of it locomotion is learned faster, HalfCheetah several times as fast;
+    tasks whose rewards have to be found first are learned less well (docs/results.md).
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
 
