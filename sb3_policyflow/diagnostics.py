@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_policyflow.common.checks import check_count
-from sb3_policyflow.common.entropy import nearest_neighbour_entropy
+from sb3_policyflow.common.entropy import action_entropy
 from sb3_policyflow.common.losses import gaussian_kl, shifted_gaussian_log_ratio
 from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
@@ -37,7 +37,7 @@ class FlowDiagnosticsCallback(BaseCallback):
     The flow is integrated with the parameters before and after the update. Given its latent, an
     action has the exact log ratio log N(a; phi', sigma'^2) - log N(a; phi, sigma^2), which the
     paper approximates by taking phi' - phi from the change of the velocity. Logged with the next
-    rollout, under ``diagnostics/``:
+    rollout, or at the end of the training, under ``diagnostics/``:
 
     - ``log_ratio_correlation``, ``log_ratio_error``: between the approximate and the exact log
       ratio, Pearson's coefficient and the root mean squared difference; and the same with
@@ -105,15 +105,19 @@ class FlowDiagnosticsCallback(BaseCallback):
         return rows(samples, chosen.to(samples.actions.device))
 
     def _on_rollout_start(self) -> None:
-        self._measure()
+        if self._before is not None:
+            self._measure()
 
     def _on_training_end(self) -> None:
-        self._measure()
+        if self._before is not None:
+            self._measure()
+            # SB3 writes the log after a rollout, and there is none to come.
+            self.logger.record("time/total_timesteps", self.num_timesteps)
+            self.logger.dump(self.num_timesteps)
 
     def _measure(self) -> None:
-        """Compare the policy with what it was before the update, if that was kept."""
-        if self._before is None:
-            return
+        """Compare the policy with what it was before the update."""
+        assert self._before is not None
         (old, samples), self._before = self._before, None
         new = self.algorithm.policy
         new.set_training_mode(False)
@@ -158,11 +162,7 @@ class FlowDiagnosticsCallback(BaseCallback):
     def _entropy(self, policy: FlowActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
         """Entropy of the actions in nats, mean over states."""
         some = rows(observations, slice(self.n_entropy_states))
-        features = policy.actor_features(some).repeat_interleave(self.n_entropy_actions, dim=0)
-        actions, _ = policy.sample_actions(features)
-        return nearest_neighbour_entropy(
-            actions.reshape(-1, self.n_entropy_actions, actions.shape[-1])
-        )
+        return action_entropy(policy, policy.actor_features(some), self.n_entropy_actions)
 
 
 def end_point_shifts(

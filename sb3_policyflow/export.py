@@ -55,7 +55,7 @@ class NormalizeObservation(nn.Module):
 
 
 class ActionModule(nn.Module):
-    """The way from observations to actions, as ``predict(deterministic=True)`` goes it.
+    """The way from observations to actions, as ``predict(deterministic=True)`` goes it from z = 0.
 
     Normalisation, preprocessing, the steps of the flow or of the denoising chain one after another,
     and the bounds of the actions: tensors in, tensors out, nothing drawn at random.

@@ -1,13 +1,16 @@
 """The diagnostics tell the truth, and change nothing."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
@@ -73,6 +76,15 @@ def test_every_so_many_rollouts() -> None:
     measured = ["action_entropy" in figures for figures in logged]
     # Before the first rollout nothing; figures stay until the log is written.
     assert measured == [False, False, True, False, True]
+
+
+def test_the_last_update_is_logged_too(tmp_path: Path) -> None:
+    model = PolicyFlow("MlpPolicy", environment(), **SMALL)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(2 * 256, FlowDiagnosticsCallback(n_samples=16))
+    log = pd.read_csv(tmp_path / "progress.csv")
+    assert log["time/total_timesteps"].tolist() == [256, 512, 512]
+    assert log["diagnostics/kl_exact"].notna().tolist() == [False, True, True]
 
 
 @pytest.mark.parametrize("path", ["rectified", "trigflow"])

@@ -33,11 +33,11 @@ def _latents_drawn(model: BaseAlgorithm, mode: str) -> Iterator[None]:
         yield
         return
     assert isinstance(model.policy, FlowActorCriticPolicy)
-    model.policy.random_latents = True
+    before, model.policy.random_latents = model.policy.random_latents, True
     try:
         yield
     finally:
-        model.policy.random_latents = False
+        model.policy.random_latents = before
 
 
 def evaluate(model: BaseAlgorithm, env: VecEnv, mode: str, n_episodes: int) -> dict[str, Any]:

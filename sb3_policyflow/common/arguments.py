@@ -1,5 +1,6 @@
 """Arguments of the flow algorithms: what there is, what is refused, what changes over time."""
 
+import math
 from typing import Any, ClassVar
 
 import torch as th
@@ -147,6 +148,8 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         for name in ("gamma", "gae_lambda"):
             checks.check_between(name, getattr(self, name), 0.0, 1.0)
         checks.check_positive_or_none("target_kl", self.target_kl)
+        if self.max_grad_norm is not None:
+            checks.check_between("max_grad_norm", self.max_grad_norm, -math.inf)
         if not callable(self.clip_range_vf):
             checks.check_positive_or_none("clip_range_vf", self.clip_range_vf)
         checks.check_count("n_steps", self.n_steps, 1)
@@ -173,18 +176,18 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         self._entropy_schedule = parse_schedule("ent_coef", self.ent_coef)
-        self._lr_rule: KLAdaptiveLearningRate | None = None
+        self._lr_rule = KLAdaptiveLearningRate(self.lr_factor, self.kl_margin, self.lr_bounds)
         if self.desired_kl is not None:
             self._kl_schedule = parse_schedule("desired_kl", self.desired_kl)
             if self._kl_schedule(1.0) == 0:
                 raise ValueError(f"desired_kl must be positive or None, got {self.desired_kl}.")
-            self._lr_rule = KLAdaptiveLearningRate(self.lr_factor, self.kl_margin, self.lr_bounds)
         self._start_adaptive_learning_rate()
 
     def _start_adaptive_learning_rate(self) -> None:
         """Begin with ``learning_rate``, unless a saved run that began with it goes on.
 
-        :raises ValueError: If ``learning_rate`` is a schedule, which nothing would follow.
+        :raises ValueError: If ``learning_rate`` is a schedule, which nothing would follow, or out
+            of its bounds.
         """
         start = self.lr_schedule(1.0)
         if self.desired_kl is None:
@@ -193,6 +196,11 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
             raise ValueError(
                 "With desired_kl the learning rate follows the divergence of the policy: give the "
                 "learning_rate that it starts with, not a schedule."
+            )
+        elif not self.lr_bounds[0] <= start <= self.lr_bounds[1]:
+            raise ValueError(
+                f"With desired_kl the learning rate keeps within lr_bounds={self.lr_bounds}, but "
+                f"it starts at learning_rate={start}: change one of them."
             )
         elif self.adaptive_learning_rate is None or self._adaptive_start != start:
             self.adaptive_learning_rate = start
@@ -223,7 +231,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
 
     def _adapt_learning_rate(self, divergences: list[th.Tensor]) -> None:
         """Move the learning rate after the mean of some divergences, if it is adaptive."""
-        if self._lr_rule is None or self.adaptive_learning_rate is None:
+        if self.adaptive_learning_rate is None:
             return
         kl = th.stack(divergences).mean().item()
         self.adaptive_learning_rate = self._lr_rule.adapt(

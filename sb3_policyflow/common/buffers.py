@@ -27,6 +27,8 @@ class RecordBufferMixin(RolloutBuffer):
         """Forget all transitions."""
         self.record_type = None
         super().reset()
+        # SB3 takes the precision of the space. Half of it would blur how an action was made.
+        self.actions = self.actions.astype(np.float32, copy=False)
 
     def add(
         self,
@@ -74,7 +76,7 @@ class RecordBufferMixin(RolloutBuffer):
         )
         return FlowRolloutBufferSamples(
             observations=self._flat_observations(),
-            actions=self._flatten(self.actions.astype(np.float32, copy=False)),
+            actions=self._flatten(self.actions),
             old_values=self._flatten(self.values),
             advantages=self._flatten(self.advantages),
             returns=self._flatten(self.returns),

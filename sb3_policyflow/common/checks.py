@@ -2,13 +2,13 @@
 
 import math
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
 from sb3_policyflow.common.buffers import (
     DictFlowRolloutBuffer,
@@ -47,6 +47,15 @@ def check_between(name: str, value: object, lowest: float, highest: float = math
         raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
 
 
+def check_number(name: str, value: object) -> None:
+    """Refuse what is not a finite number.
+
+    :raises ValueError: If it is not.
+    """
+    if not isinstance(value, Real) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}.")
+
+
 def check_positive(name: str, value: object) -> None:
     """Refuse a number that is not positive.
 
@@ -54,6 +63,17 @@ def check_positive(name: str, value: object) -> None:
     """
     if not isinstance(value, Real) or not float(value) > 0:
         raise ValueError(f"{name} must be positive, got {value!r}.")
+
+
+def check_bounds(name: str, value: object) -> None:
+    """Refuse what is not a lowest and a highest number, which may be the same.
+
+    :raises ValueError: If it is not.
+    """
+    bounds = list(value) if isinstance(value, Sequence) else []
+    are_numbers = all(isinstance(bound, Real) for bound in bounds)
+    if len(bounds) != 2 or not are_numbers or not bounds[0] <= bounds[1]:
+        raise ValueError(f"{name} must be two numbers in order, got {value!r}.")
 
 
 def check_positive_or_none(name: str, value: object) -> None:
@@ -100,7 +120,7 @@ def choose_buffer_class(
 ) -> type[RecordBufferMixin]:
     """The buffer for an observation space, or the user's own if it keeps a record.
 
-    :raises ValueError: If the user's own keeps none.
+    :raises ValueError: If the user's own keeps none, or is for other observations.
     """
     is_dict = isinstance(observation_space, spaces.Dict)
     default = DictFlowRolloutBuffer if is_dict else FlowRolloutBuffer
@@ -111,6 +131,12 @@ def choose_buffer_class(
             f"{algorithm} needs a rollout buffer that keeps how each action was made, which "
             f"{given.__name__} does not: leave out rollout_buffer_class, or derive yours from "
             f"{default.__module__}.{default.__name__}."
+        )
+    if issubclass(given, DictRolloutBuffer) is not is_dict:
+        kind = "dictionaries of observations" if is_dict else "observations that are arrays"
+        raise ValueError(
+            f"{given.__name__} does not store {kind}, which the environment has: leave out "
+            f"rollout_buffer_class, or derive yours from {default.__module__}.{default.__name__}."
         )
     return given
 

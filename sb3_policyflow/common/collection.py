@@ -201,6 +201,10 @@ class CollectionMixin(OnPolicyAlgorithm):
             yield self.env
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError(
+                "The model has no environment to learn in: give one to load, as env, or to set_env."
+            )
         with self._guarded() as env:
             prepared = super()._setup_learn(*args, **kwargs)
             RolloutVecEnv(env, self.num_timesteps).check_observations(self._last_obs)

@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.policies import FlowActorCriticPolicy
 
 SMALLEST_DISTANCE = 1e-6
 """Actions nearer than this count as this far apart: clipped ones may coincide."""
@@ -26,12 +27,24 @@ def nearest_neighbour_entropy(samples: th.Tensor) -> th.Tensor:
     :return: The mean entropy in nats, a tensor without dimensions.
     """
     n_samples, dim = samples.shape[-2:]
-    distances = th.cdist(samples, samples)
+    # The matrix product that torch prefers cancels where samples are close but far from 0.
+    distances = th.cdist(samples, samples, compute_mode="donot_use_mm_for_euclid_dist")
     itself = th.eye(n_samples, dtype=th.bool, device=samples.device)
     nearest = distances.masked_fill(itself, math.inf).amin(dim=-1).clamp_min(SMALLEST_DISTANCE)
     log_ball = 0.5 * dim * math.log(math.pi) - math.lgamma(0.5 * dim + 1)
     harmonic = math.fsum(1 / i for i in range(1, n_samples))  # psi(m) - psi(1)
     return harmonic + log_ball + dim * nearest.log().mean()
+
+
+def action_entropy(policy: FlowActorCriticPolicy, features: th.Tensor, n_actions: int) -> th.Tensor:
+    """Entropy of a policy's actions in nats, from several in each state, mean over the states.
+
+    :param policy: The policy, through whose steps the entropy is differentiated.
+    :param features: The actor's features of the states, shape (n, features_dim).
+    :param n_actions: How many to draw in each, at least 2.
+    """
+    actions, _ = policy.sample_actions(features.repeat_interleave(n_actions, dim=0))
+    return nearest_neighbour_entropy(actions.reshape(len(features), n_actions, -1))
 
 
 class SampledEntropyMixin(FlowOnPolicyAlgorithm):
@@ -57,8 +70,6 @@ class SampledEntropyMixin(FlowOnPolicyAlgorithm):
         ent_coef = self._now(self._entropy_schedule)
         if ent_coef == 0:
             return features.new_zeros(()), {}
-        some = features[: self.n_entropy_states].repeat_interleave(self.n_entropy_actions, dim=0)
-        actions, _ = self.policy.sample_actions(some)
-        in_each_state = actions.reshape(-1, self.n_entropy_actions, actions.shape[-1])
-        entropy = nearest_neighbour_entropy(in_each_state)
+        some = features[: self.n_entropy_states]
+        entropy = action_entropy(self.policy, some, self.n_entropy_actions)
         return -ent_coef * entropy, {"entropy_loss": -entropy}

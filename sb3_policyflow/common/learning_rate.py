@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from sb3_policyflow.common.checks import check_between, check_bounds, check_positive
+
 
 @dataclass(frozen=True)
 class KLAdaptiveLearningRate:
@@ -26,10 +28,13 @@ class KLAdaptiveLearningRate:
     bounds: tuple[float, float] = (1e-6, 1e-2)
 
     def __post_init__(self) -> None:
-        if self.factor <= 1 or self.margin < 1:
-            raise ValueError("lr_factor must be greater than 1 and kl_margin at least 1.")
-        if not 0 < self.bounds[0] <= self.bounds[1]:
-            raise ValueError(f"lr_bounds must be two positive numbers in order, got {self.bounds}.")
+        check_between("kl_margin", self.margin, 1)
+        check_positive("lr_factor", self.factor)
+        check_bounds("lr_bounds", self.bounds)
+        if self.factor <= 1:
+            raise ValueError(f"lr_factor must be greater than 1, got {self.factor}.")
+        if self.bounds[0] <= 0:
+            raise ValueError(f"lr_bounds must be positive, got {self.bounds}.")
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
         """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""

@@ -86,7 +86,7 @@ def clipped_surrogate(
 
 
 def _clamp(values: th.Tensor, low: Any, high: Any) -> th.Tensor:
-    """What torch knows with two numbers and with two tensors, but not of either kind."""
+    """Keep within bounds; torch's own signatures are for two numbers or two tensors, not either."""
     return values.clamp(low, high)
 
 

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_policyflow.common.checks import check_count
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
 from sb3_policyflow.flows import SOLVERS, Path
 from sb3_policyflow.flows.choices import choose
@@ -47,7 +48,7 @@ class OdeFlowPolicy(FlowActorCriticPolicy):
         self.n_flow_steps = n_flow_steps
         self.solver = solver
         choose("solver", solver, SOLVERS)
-        solver_times(solver, n_flow_steps)
+        check_count("n_flow_steps", n_flow_steps, 1)
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         self._flow = FlowSampler(solver, n_flow_steps, flow_path.end_time)
 

@@ -92,6 +92,8 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             if self.target_kl is not None and kl.item() > 1.5 * self.target_kl:
                 if self.verbose >= 1:
                     sys.stdout.write(f"Early stopping due to reaching max kl: {kl.item():.2f}\n")
+                # The epoch has no end to adapt at, and this is what is wrong with the rate.
+                self._adapt_learning_rate(divergences[-1:])
                 return False
             self._optimise(loss, parameters)
             if self.lr_adaptation == "minibatch":
@@ -104,7 +106,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         self, batch: FlowRolloutBufferSamples, behaviour: Any
     ) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         """The loss of a minibatch, the divergence of the policy, and figures to log."""
-        actor_features, critic_features = self.policy.actor_critic_features(batch.observations)
+        actor_features, critic_features = self._features(batch)
         terms = self._policy_terms(batch, actor_features, behaviour)
         policy_loss = -self._surrogate(terms.log_ratio, self._advantages(batch)).mean()
         value_loss = self._value_loss(batch, self.policy.values(critic_features).flatten())
@@ -117,6 +119,10 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         }
         self._last_loss = loss.detach()
         return loss, terms.kl, figures
+
+    def _features(self, batch: FlowRolloutBufferSamples) -> tuple[th.Tensor, th.Tensor]:
+        """Features of a minibatch for actor and critic, each of shape (n, features_dim)."""
+        return self.policy.actor_critic_features(batch.observations)
 
     def _advantages(self, batch: FlowRolloutBufferSamples) -> th.Tensor:
         """Advantages of a minibatch, shape (n,)."""

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
@@ -51,6 +52,8 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param frequencies: Frequencies of the time embedding, or how many to draw.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
     :param initialisation: "glorot", "glorot_zero_output" or "zero".
+    :param random_latents: Whether ``predict(deterministic=True)`` draws the latents and leaves out
+        the noise only. May be set later.
     :raises ValueError: If an option is not supported.
     """
 
@@ -60,12 +63,11 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         "frequencies",
         "frequency_scale",
         "initialisation",
+        "random_latents",
     )
     """Constructor arguments that SB3's ``save`` of a policy does not know of."""
 
     mlp_extractor: MlpExtractor
-    random_latents: bool = False
-    """Whether ``predict(deterministic=True)`` draws the latents and leaves out the noise only."""
 
     def __init__(
         self,
@@ -86,12 +88,14 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
         initialisation: str = "glorot_zero_output",
+        random_latents: bool = False,
     ) -> None:
         check_flow_spaces(action_space, use_sde)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
         self.initialisation = initialisation
+        self.random_latents = random_latents
         if net_arch is None and features_extractor_class is NatureCNN:
             # SB3 puts no layer behind its CNN, but a velocity without one is linear in the action.
             net_arch = {"pi": [64, 64], "vf": []}
@@ -272,12 +276,17 @@ def is_in_mode(module: nn.Module, mode: bool) -> bool:
 def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
     """Refuse what a flow policy cannot do.
 
-    :raises ValueError: If the actions are not continuous, or gSDE is asked for.
+    :raises ValueError: If the actions are not continuous or not floats, or gSDE is asked for.
     """
     if not isinstance(action_space, spaces.Box):
         raise ValueError(
             f"Flow policies need continuous actions (a Box), but the action space is "
             f"{action_space}: use PPO of stable_baselines3 for it."
+        )
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(
+            f"Flow policies draw real numbers, but the actions are {action_space.dtype}: declare a "
+            "Box of np.float32, and round in the environment (gymnasium.wrappers.TransformAction)."
         )
     if use_sde:
         raise ValueError(

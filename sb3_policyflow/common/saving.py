@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv
@@ -72,6 +73,9 @@ class SavingMixin(OnPolicyAlgorithm):
     of the random generators come on top.
     """
 
+    _saved_random_states: RandomStates | None = None
+    """Those that the next ``learn`` goes on with. A model that only acts leaves them alone."""
+
     def save(
         self,
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -100,7 +104,7 @@ class SavingMixin(OnPolicyAlgorithm):
     def _resume_state(self) -> ResumeState:
         normalize = self.get_vec_normalize_env()
         return ResumeState(
-            random_states=RandomStates.now(self.device),
+            random_states=self._saved_random_states or RandomStates.now(self.device),
             normalized_returns=None if normalize is None else normalize.returns.copy(),
         )
 
@@ -119,9 +123,9 @@ class SavingMixin(OnPolicyAlgorithm):
     ) -> SelfSaving:
         """Load a model; see SB3.
 
-        The random generators of torch, numpy and Python go back to where they were when the model
-        was saved, so that training goes on as it would have. Environments are seeded with the
-        model's seed and reset, as in SB3, unless ``force_reset`` is False.
+        The next ``learn`` puts the random generators of torch, numpy and Python back to where they
+        were when the model was saved, so that training goes on as it would have. Environments are
+        seeded with the model's seed and reset, as in SB3, unless ``force_reset`` is False.
 
         :param path: The file, or one opened for reading.
         :param env: The environment to go on with.
@@ -130,8 +134,8 @@ class SavingMixin(OnPolicyAlgorithm):
         :param print_system_info: Whether to print on what system the model was saved.
         :param force_reset: Whether training starts with new episodes. False goes on from the last
             observations, which is right only if ``env`` is in the state it was in.
-        :param reseed: Whether to start the random generators anew from the model's seed, as SB3
-            does. So does a ``seed`` among ``kwargs``.
+        :param reseed: Whether to leave the random generators as the model's seed, if it has one,
+            starts them anew, as SB3 does. So does a ``seed`` among ``kwargs``.
         :param kwargs: Attributes to change.
         :raises ValueError: If the file is no saved model, or the environment does not fit it.
         """
@@ -145,8 +149,17 @@ class SavingMixin(OnPolicyAlgorithm):
         if not force_reset:
             model._go_on_in_env(state)
         if state is not None and not reseed and "seed" not in kwargs:
-            state.random_states.restore(model.device)
+            model._saved_random_states = state.random_states
         return model
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self._saved_random_states is not None:
+            self._saved_random_states.restore(self.device)
+            self._saved_random_states = None
+        return super()._setup_learn(*args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_saved_random_states"]
 
     def _go_on_in_env(self, state: ResumeState | None) -> None:
         """Fit an environment that is not reset to the last observations."""

@@ -40,7 +40,7 @@ class DPPO(SampledEntropyMixin):
     :param process: "ddpm", or "flow" for Euler steps with noise of a fixed standard deviation.
     :param n_denoising_steps: K, steps from noise to action.
     :param n_finetuned_steps: How many of them, the last ones, are trained; the others belong to a
-        frozen copy of the network. All if None.
+        frozen copy of the actor's networks. All if None.
     :param min_sampling_std: Least standard deviation of a step.
     :param min_log_prob_std: Least standard deviation that the likelihood of a step is taken with.
     :param noise_clip: Bound of a step's noise, in its standard deviations; None for none.
@@ -182,6 +182,7 @@ class DPPO(SampledEntropyMixin):
         self.n_critic_warmup = n_critic_warmup
         self.n_entropy_actions = n_entropy_actions
         self.n_entropy_states = n_entropy_states
+        self._n_rollouts = 0
         if _init_setup_model:
             self._setup_model()
 
@@ -193,10 +194,8 @@ class DPPO(SampledEntropyMixin):
         checks.check_count("n_critic_warmup", self.n_critic_warmup, 0)
         if not 0 < self.denoising_gamma <= 1:
             raise ValueError(f"denoising_gamma must be in (0, 1], got {self.denoising_gamma}.")
-        if self.log_prob_clamp is not None and not self.log_prob_clamp[0] < self.log_prob_clamp[1]:
-            raise ValueError(
-                f"log_prob_clamp must be two numbers in order, or None, got {self.log_prob_clamp}."
-            )
+        if self.log_prob_clamp is not None:
+            checks.check_bounds("log_prob_clamp", self.log_prob_clamp)
 
     def _behaviour(self, rollout: FlowRolloutBufferSamples) -> None:
         """Nothing: the record has the old means."""
@@ -222,6 +221,13 @@ class DPPO(SampledEntropyMixin):
         if self._is_critic_warming_up:
             log_ratio, regulariser = log_ratio.detach(), regulariser.detach()
         return PolicyTerms(log_ratio, divergence, regulariser, figures)
+
+    def _features(self, batch: FlowRolloutBufferSamples) -> tuple[th.Tensor, th.Tensor]:
+        actor_features, critic_features = super()._features(batch)
+        if self._is_critic_warming_up and self.policy.share_features_extractor:
+            # What extracts them is the actor's too.
+            critic_features = critic_features.detach()
+        return actor_features, critic_features
 
     def _log_probs(self, record: DPPORecord, means: th.Tensor) -> th.Tensor:
         """Log likelihoods of the trained steps around some means, shape (n, k)."""
@@ -250,7 +256,12 @@ class DPPO(SampledEntropyMixin):
 
     @property
     def _is_critic_warming_up(self) -> bool:
-        return self._n_updates < self.n_critic_warmup * self.n_epochs
+        return self._n_rollouts < self.n_critic_warmup
+
+    def train(self) -> None:
+        """Update the policy with the rollout in the buffer."""
+        super().train()
+        self._n_rollouts += 1
 
     def _adapt_learning_rate(self, divergences: list[th.Tensor]) -> None:
         # A policy that does not learn gives no reason to learn faster.

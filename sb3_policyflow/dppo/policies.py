@@ -6,7 +6,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
 from sb3_policyflow.common.checks import (
@@ -42,7 +43,7 @@ class DPPOPolicy(FlowActorCriticPolicy):
     :param process: "ddpm", or "flow" for Euler steps with noise of a fixed standard deviation.
     :param n_denoising_steps: K, steps from noise to action.
     :param n_finetuned_steps: How many of them, the last ones, are trained; the others belong to a
-        frozen copy of the network, see :meth:`freeze_base`. All if None.
+        frozen copy of the networks, see :meth:`freeze_base`. All if None.
     :param min_sampling_std: Least standard deviation of a step.
     :param min_log_prob_std: Least standard deviation that the likelihood of a step is taken with.
     :param noise_clip: Bound of a step's noise, in its standard deviations; None for none.
@@ -97,7 +98,11 @@ class DPPOPolicy(FlowActorCriticPolicy):
         check_count("n_denoising_steps", self.n_denoising_steps, 1)
         if self.n_finetuned_steps is not None:
             check_count("n_finetuned_steps", self.n_finetuned_steps, 1)
-            check_count("n_denoising_steps", self.n_denoising_steps, self.n_finetuned_steps)
+            if self.n_finetuned_steps > self.n_denoising_steps:
+                raise ValueError(
+                    "n_finetuned_steps must be some of the n_denoising_steps="
+                    f"{self.n_denoising_steps}, got {self.n_finetuned_steps}."
+                )
         for name in ("min_sampling_std", "min_log_prob_std", "denoised_clip"):
             check_positive(name, getattr(self, name))
         check_positive_or_none("noise_clip", self.noise_clip)
@@ -116,11 +121,42 @@ class DPPOPolicy(FlowActorCriticPolicy):
         self.n_frozen_steps = self.n_denoising_steps - n_trained
         if self.n_frozen_steps > 0:
             self.base_velocity = deepcopy(self.velocity).requires_grad_(False)
+            self.base_features_extractor = deepcopy(self.pi_features_extractor)
+            self.base_features_extractor.requires_grad_(False)
 
     def freeze_base(self) -> None:
-        """Let the steps that are not trained use the network as it is now, say after imitation."""
+        """Let the steps that are not trained use the networks as they are now, say after imitation.
+
+        These are the velocity field and the actor's features extractor.
+        """
         if self.n_frozen_steps > 0:
             self.base_velocity.load_state_dict(self.velocity.state_dict())
+            extractor = self.pi_features_extractor.state_dict()
+            self.base_features_extractor.load_state_dict(extractor)
+
+    def actor_features(self, obs: PyTorchObs) -> th.Tensor:
+        """Features for the actor, shape (n, features_dim).
+
+        Where some steps are frozen and the extractor learns, (n, 2 features_dim): behind those for
+        the trained steps those for the frozen ones.
+        """
+        return self._with_base(super().actor_features(obs), obs)
+
+    def actor_critic_features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """Features for actor and critic, extracted once where they are shared."""
+        actor_features, critic_features = super().actor_critic_features(obs)
+        return self._with_base(actor_features, obs), critic_features
+
+    @property
+    def _has_base_features(self) -> bool:
+        learns = any(True for _ in self.pi_features_extractor.parameters())
+        return self.n_frozen_steps > 0 and learns
+
+    def _with_base(self, features: th.Tensor, obs: PyTorchObs) -> th.Tensor:
+        if not self._has_base_features:
+            return features
+        extract = super(ActorCriticPolicy, self).extract_features
+        return th.cat([features, extract(obs, self.base_features_extractor)], dim=-1)
 
     @property
     def log_prob_stds(self) -> th.Tensor:
@@ -139,6 +175,9 @@ class DPPOPolicy(FlowActorCriticPolicy):
     def _means(self, points: th.Tensor, steps: Steps, features: th.Tensor) -> th.Tensor:
         is_frozen = isinstance(steps, int) and steps < self.n_frozen_steps
         network = self.base_velocity if is_frozen else self.velocity
+        if self._has_base_features:
+            trained, base = features.tensor_split(2, dim=-1)
+            features = base if is_frozen else trained
         return self.process.means(
             points, network(points, self.process.times[steps], features), steps
         )

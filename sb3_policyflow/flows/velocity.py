@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from numbers import Integral
 
 import torch as th
 from torch import nn
@@ -23,6 +24,7 @@ class FourierTimeEmbedding(nn.Module):
         N(0, ``frequency_scale``^2); half the embedding's size if not given.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
     :param activation_fn: Activation of the MLP.
+    :raises ValueError: If there are no frequencies.
     """
 
     frequencies: th.Tensor
@@ -37,10 +39,7 @@ class FourierTimeEmbedding(nn.Module):
         super().__init__()
         if frequencies is None:
             frequencies = max(embedding_dim // 2, 1)
-        if isinstance(frequencies, int):
-            values = frequency_scale * th.randn(frequencies)
-        else:
-            values = th.as_tensor(frequencies, dtype=th.get_default_dtype())
+        values = _given_or_drawn(frequencies, frequency_scale)
         self.register_buffer("frequencies", values)
         self.mlp = nn.Sequential(
             nn.Linear(2 * len(values), embedding_dim),
@@ -53,6 +52,17 @@ class FourierTimeEmbedding(nn.Module):
         phases = 2 * math.pi * times.unsqueeze(-1) * self.frequencies
         embedding: th.Tensor = self.mlp(th.cat([phases.cos(), phases.sin()], dim=-1))
         return embedding
+
+
+def _given_or_drawn(frequencies: object, scale: float) -> th.Tensor:
+    if isinstance(frequencies, Integral) and int(frequencies) >= 1:
+        return scale * th.randn(int(frequencies))
+    values = th.as_tensor(frequencies, dtype=th.get_default_dtype())
+    if values.dim() != 1 or len(values) == 0:
+        raise ValueError(
+            f"frequencies must be a list of numbers, or how many to draw, got {frequencies!r}."
+        )
+    return values
 
 
 class VelocityField(nn.Module):

@@ -8,7 +8,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import check_positive
+from sb3_policyflow.common.checks import check_bounds, check_number, check_positive
 from sb3_policyflow.common.ode_policy import OdeFlowPolicy
 from sb3_policyflow.flows import PATHS
 from sb3_policyflow.flows.choices import choose
@@ -67,8 +67,9 @@ class FlowPolicy(OdeFlowPolicy):
         gaussian: bool = False,
         **kwargs: Any,
     ) -> None:
-        if log_std_bounds is not None and not log_std_bounds[0] <= log_std_bounds[1]:
-            raise ValueError(f"log_std_bounds must be two numbers in order, got {log_std_bounds}.")
+        check_number("log_std_init", log_std_init)
+        if log_std_bounds is not None:
+            check_bounds("log_std_bounds", log_std_bounds)
         self.log_std_bounds = log_std_bounds
         self.latent_std = latent_std
         self.path_name = path

@@ -60,7 +60,8 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     :param brownian_coef: w_b, weight of the Brownian regulariser: a constant, "lin_START",
         "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
         entropy of the Gaussian noise and takes the same forms.
-    :param path: Interpolation path: "rectified", "stochastic", "stochastic_exact" or "trigflow".
+    :param path: Interpolation path: "rectified", "stochastic", "stochastic_exact" or "trigflow". In
+        ``load``, whose file is a ``path`` too, change it by ``custom_objects={"path": ...}``.
     :param time_sampler: Times of the update: "grid" (the solver's own), "starts" (the same without
         the end) or "uniform".
     :param n_times: Times for each sample.

@@ -19,6 +19,13 @@ def test_entropy_of_gaussians(dim: int, std: float) -> None:
     assert nearest_neighbour_entropy(samples).item() == pytest.approx(exact, abs=0.08 * dim)
 
 
+@pytest.mark.parametrize("n_actions", [8, 64])
+def test_entropy_does_not_depend_on_where_the_samples_are(n_actions: int) -> None:
+    samples = 1e-3 * th.randn(200, n_actions, 2)
+    entropies = [nearest_neighbour_entropy(samples + offset).item() for offset in (0.0, 5.0)]
+    assert entropies[1] == pytest.approx(entropies[0], abs=0.02)
+
+
 def test_two_samples_by_hand() -> None:
     """psi(2) - psi(1) = 1, the unit "ball" of the line is 2 long, both neighbours 3 away."""
     samples = th.tensor([[[0.0], [3.0]]])
@@ -28,7 +35,7 @@ def test_two_samples_by_hand() -> None:
 
 def test_gradient_spreads_the_samples() -> None:
     scale = th.ones((), requires_grad=True)
-    nearest_neighbour_entropy(scale * th.randn(50, 8, 3)).backward()
+    nearest_neighbour_entropy(5 + scale * 1e-2 * th.randn(50, 32, 3)).backward()
     assert scale.grad is not None
     assert scale.grad.item() == pytest.approx(3.0, rel=1e-4)  # H(cX) = H(X) + d log c
 

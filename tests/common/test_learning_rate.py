@@ -24,7 +24,7 @@ def test_rule(learning_rate: float, kl: float, expected: float) -> None:
     ("options", "message"),
     [
         ({"factor": 1.0}, "lr_factor must be greater than 1"),
-        ({"bounds": (1e-2, 1e-6)}, "lr_bounds must be two positive"),
+        ({"bounds": (1e-2, 1e-6)}, "lr_bounds must be two numbers in order"),
     ],
 )
 def test_senseless_rules_are_refused(options: dict[str, float], message: str) -> None:

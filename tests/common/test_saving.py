@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
@@ -58,13 +59,47 @@ def test_resumed_runs_equal_each_other_and_the_uninterrupted_one(
     assert resumed == {uninterrupted}
 
 
-def test_load_puts_random_states_back(tmp_path: Path) -> None:
+class Draws(BaseCallback):
+    """Draws when a training starts, as training then would."""
+
+    def _on_training_start(self) -> None:
+        self.drawn = draws()
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def drawn_in_learning(model: PolicyFlow) -> list[float]:
+    callback = Draws()
+    model.learn(32, callback, reset_num_timesteps=False)
+    return callback.drawn
+
+
+@pytest.mark.parametrize("by_way_of_another_file", [False, True])
+def test_learning_goes_on_from_the_saved_random_states(
+    by_way_of_another_file: bool, tmp_path: Path
+) -> None:
     model = small_model().learn(32)
     model.save(tmp_path / "model")
     expected = draws()
-    PolicyFlow.load(tmp_path / "model")
-    assert draws() == expected
     assert not hasattr(model, "resume_state")
+    env = make_vec_env("Pendulum-v1")
+    loaded = PolicyFlow.load(tmp_path / "model", env=env)
+    if by_way_of_another_file:
+        loaded.save(tmp_path / "model")
+        loaded = PolicyFlow.load(tmp_path / "model", env=env)
+    draws()
+    assert drawn_in_learning(loaded) == expected
+    assert drawn_in_learning(loaded) != expected
+
+
+def test_a_model_that_only_acts_leaves_the_random_states_alone(tmp_path: Path) -> None:
+    small_model(seed=None).save(tmp_path / "model")
+    first, second = (
+        (PolicyFlow.load(tmp_path / "model").predict(np.ones(3, np.float32))[0].item(), *draws())
+        for _ in range(2)
+    )
+    assert not set(first) & set(second)
 
 
 @pytest.mark.parametrize("options", [{"reseed": True}, {"seed": 0}])
@@ -73,12 +108,11 @@ def test_load_can_reseed_as_sb3_does(options: dict[str, Any], tmp_path: Path) ->
     outcomes = []
     for _ in range(2):
         draws()
-        loaded = PolicyFlow.load(tmp_path / "model", **options)
-        outcomes.append(draws())
+        env = make_vec_env("Pendulum-v1")
+        loaded = PolicyFlow.load(tmp_path / "model", env=env, **options)
+        outcomes.append(drawn_in_learning(loaded))
     assert loaded.seed == 0
-    fresh = small_model()
-    assert outcomes[0] == outcomes[1] == draws()
-    assert fresh.num_timesteps == 0
+    assert outcomes[0] == outcomes[1] == drawn_in_learning(small_model())
 
 
 def test_a_model_without_a_seed_is_repeatable_too(tmp_path: Path) -> None:
@@ -95,8 +129,9 @@ def test_a_model_without_a_seed_is_repeatable_too(tmp_path: Path) -> None:
 def test_files_without_random_states_load(tmp_path: Path) -> None:
     small_model().learn(32).save(tmp_path / "model", exclude=["resume_state"])
     expected = draws()
-    assert PolicyFlow.load(tmp_path / "model").num_timesteps == 32
-    assert draws() != expected
+    loaded = PolicyFlow.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"))
+    assert loaded.num_timesteps == 32
+    assert drawn_in_learning(loaded) != expected
 
 
 def test_going_on_in_the_middle_of_episodes(tmp_path: Path) -> None:

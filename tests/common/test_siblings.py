@@ -99,6 +99,16 @@ def test_predict(algorithm: Algorithm, options: dict[str, Any]) -> None:
 
 
 @both
+def test_latents_that_are_always_drawn_survive_a_file(algorithm: Algorithm, tmp_path: Path) -> None:
+    kwargs = {"random_latents": True}
+    algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs=kwargs, **SMALL).save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    loaded.policy.save(tmp_path / "policy")
+    for policy in (loaded.policy, type(loaded.policy).load(tmp_path / "policy")):
+        assert policy.random_latents
+
+
+@both
 def test_dict_observations(algorithm: Algorithm) -> None:
     env = SimpleMultiObsEnv(discrete_actions=False)
     model = algorithm("MultiInputFlowPolicy", env, **SMALL).learn(64)
@@ -195,16 +205,18 @@ def _plain(annotation: Any) -> str:
         (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, or None"),
         (FPO, {"action_noise_std": -0.1}, "action_noise_std must be a number from 0"),
         (FPO, {"solver": "newton"}, "Unknown solver 'newton'"),
-        (FPO, {"n_flow_steps": 0}, "at least one solver step"),
+        (FPO, {"n_flow_steps": 0}, "n_flow_steps must be at least 1"),
+        (FPO, {"n_flow_steps": 2.5}, "and a whole number, got 2.5"),
         (FPO, {"ent_coef": -1.0}, "ent_coef must not be negative"),
         (FPO, {"n_entropy_actions": 1}, "n_entropy_actions must be at least 2"),
         (FPO, {"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to FPO itself"),
         (DPPO, {"process": "vp"}, "process must be one of 'ddpm', 'flow'"),
         (DPPO, {"n_denoising_steps": 0}, "n_denoising_steps must be at least 1"),
-        (DPPO, {"n_finetuned_steps": 11}, "n_denoising_steps must be at least 11"),
+        (DPPO, {"n_finetuned_steps": 11}, "some of the n_denoising_steps=10, got 11"),
         (DPPO, {"min_sampling_std": 0.0}, "min_sampling_std must be positive"),
         (DPPO, {"min_log_prob_std": -1.0}, "min_log_prob_std must be positive"),
         (DPPO, {"log_prob_clamp": (2.0, -5.0)}, "log_prob_clamp must be two numbers in order"),
+        (DPPO, {"log_prob_clamp": 3.0}, "log_prob_clamp must be two numbers in order, got 3.0"),
         (DPPO, {"log_prob_reduction": "max"}, "log_prob_reduction must be one of"),
         (DPPO, {"denoising_gamma": 1.5}, r"denoising_gamma must be in \(0, 1\]"),
         (DPPO, {"clip_range_base": 0.0}, "clip_range_base must be positive"),

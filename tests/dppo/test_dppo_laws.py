@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.envs import FakeImageEnv
 from torch.distributions import Normal
 
 from sb3_policyflow import DPPO
@@ -171,6 +172,52 @@ def test_only_the_critic_warms_up() -> None:
     assert model.adaptive_learning_rate == 3e-4
     model.learn(64, reset_num_timesteps=False)
     assert not th.equal(model.policy.velocity.output.weight, untrained)
+
+
+def image_model(**options: Any) -> DPPO:
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    policy_kwargs = {"initialisation": "glorot", **options.pop("policy_kwargs", {})}
+    sizes = {"n_steps": 32, "batch_size": 16, "n_epochs": 4, "learning_rate": 1e-3}
+    return DPPO("CnnPolicy", env, policy_kwargs=policy_kwargs, seed=0, **sizes, **options)
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_the_critic_warms_up_without_the_extractor_of_the_actor(share: bool) -> None:
+    model = image_model(n_critic_warmup=2, policy_kwargs={"share_features_extractor": share})
+    obs = model.observation_space.sample()
+    before = model.predict(obs, deterministic=True)[0]
+    critic = model.policy.value_net.weight.clone()
+    model.learn(2 * 32)
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], before)
+    assert not th.equal(model.policy.value_net.weight, critic)
+    model.learn(32, reset_num_timesteps=False)
+    assert not np.array_equal(model.predict(obs, deterministic=True)[0], before)
+
+
+def test_warming_up_takes_rollouts_however_long_their_updates() -> None:
+    model, _ = collected(n_critic_warmup=2)
+    model.n_epochs = 4
+    assert model._is_critic_warming_up
+    model.train()
+    assert not model._is_critic_warming_up
+
+
+def test_frozen_steps_do_not_follow_the_extractor() -> None:
+    model = image_model(n_finetuned_steps=2)
+    obs = model.policy.obs_to_tensor(model.env.reset())[0]  # type: ignore[union-attr]
+
+    def means() -> tuple[th.Tensor, th.Tensor]:
+        with th.no_grad():
+            features = model.policy.actor_features(obs)
+            points = th.zeros(1, model.policy.action_dim)  # where no bound hides a change
+            first, last = (model.policy._means(points, step, features) for step in (7, 8))
+        return first, last
+
+    (frozen, trained), _ = means(), model.learn(3 * 32)
+    assert th.equal(means()[0], frozen)
+    assert not th.equal(means()[1], trained)
+    model.policy.freeze_base()
+    assert not th.equal(means()[0], frozen)
 
 
 def test_untrained_policy_stays_off_the_bounds_with_the_identity_skip() -> None:

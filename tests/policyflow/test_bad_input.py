@@ -1,16 +1,19 @@
 """What cannot work is refused with a sentence, before training."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.envs import IdentityEnv, SimpleMultiObsEnv
+from stable_baselines3.common.envs import IdentityEnv, IdentityEnvBox, SimpleMultiObsEnv
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_policyflow import PolicyFlow
+from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 
 SMALL = {"n_steps": 16, "batch_size": 8}
 
@@ -25,12 +28,21 @@ def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
         PolicyFlow("MlpPolicy", IdentityEnv(space=space), **SMALL)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
+def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
+    env = IdentityEnvBox()
+    env.action_space = spaces.Box(0, 100, (1,), dtype)
+    with pytest.raises(ValueError, match=rf"the actions are {dtype.__name__}: declare a Box"):
+        PolicyFlow("MlpPolicy", env, **SMALL)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"use_sde": True}, r"use_sde=True is not supported: leave it out"),
         ({"rollout_buffer_class": RolloutBuffer}, r"needs a rollout buffer that keeps.*derive"),
-        ({"n_flow_steps": 0}, r"at least one solver step"),
+        ({"n_flow_steps": 0}, r"n_flow_steps must be at least 1"),
+        ({"n_flow_steps": None}, r"n_flow_steps must be at least 1, and a whole number, got None"),
         ({"path": "straight"}, r"Unknown path 'straight': choose one of 'rectified', 'stochastic'"),
         ({"solver": "dopri5"}, r"Unknown solver 'dopri5': choose one of 'euler', 'midpoint'"),
         ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'starts', 'uniform'"),
@@ -42,9 +54,24 @@ def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
         ({"brownian_reduction": "max"}, r"brownian_reduction must be one of 'sum', 'mean'"),
         ({"desired_kl": 0.0}, r"desired_kl must be positive or None"),
         ({"desired_kl": 0.01, "learning_rate": LinearSchedule(1e-3, 0, 1)}, r"not a schedule"),
+        ({"desired_kl": 0.01, "learning_rate": 0.05}, r"but it starts at learning_rate=0.05"),
+        ({"desired_kl": 0.01, "learning_rate": 0.0}, r"but it starts at learning_rate=0.0"),
+        ({"lr_bounds": None}, r"lr_bounds must be two numbers in order, got None"),
+        ({"lr_bounds": (0.0, 1e-3)}, r"lr_bounds must be positive"),
+        ({"lr_factor": 0.5}, r"lr_factor must be greater than 1, got 0.5"),
+        ({"kl_margin": 0.5}, r"kl_margin must be a number from 1 to inf"),
+        ({"max_grad_norm": float("nan")}, r"max_grad_norm must be a number"),
+        ({"max_grad_norm": "a"}, r"max_grad_norm must be a number"),
         ({"target_kl": -1.0}, r"target_kl must be positive"),
         ({"n_epochs": 2.5}, r"n_epochs must be at least 1, and a whole number"),
         ({"policy_kwargs": {"log_std_bounds": (2.0, -5.0)}}, r"log_std_bounds must be two numbers"),
+        ({"policy_kwargs": {"log_std_bounds": (-1,)}}, r"log_std_bounds must be two numbers"),
+        (
+            {"policy_kwargs": {"log_std_init": float("nan")}},
+            r"log_std_init must be a finite number",
+        ),
+        ({"policy_kwargs": {"frequencies": 0}}, r"frequencies must be a list of numbers"),
+        ({"policy_kwargs": {"frequencies": 2.5}}, r"frequencies must be a list of numbers"),
         ({"policy_kwargs": {"latent_std": 0.0}}, r"latent_std must be positive, got 0.0"),
         (
             {"policy_kwargs": {"latent_std": 0.5}, "path": "stochastic"},
@@ -95,6 +122,26 @@ def test_policies_of_another_kind() -> None:
 def test_flat_policy_for_dict_observations() -> None:
     with pytest.raises(ValueError, match="MultiInputPolicy"):
         PolicyFlow("MlpPolicy", SimpleMultiObsEnv(discrete_actions=False))
+
+
+@pytest.mark.parametrize(
+    ("env", "buffer"),
+    [
+        (SimpleMultiObsEnv(discrete_actions=False), FlowRolloutBuffer),
+        ("Pendulum-v1", DictFlowRolloutBuffer),
+    ],
+    ids=["array buffer", "dict buffer"],
+)
+def test_buffers_for_other_observations(env: Any, buffer: type[RolloutBuffer]) -> None:
+    policy = "MlpPolicy" if isinstance(env, str) else "MultiInputPolicy"
+    with pytest.raises(ValueError, match=rf"{buffer.__name__} does not store .*: leave out"):
+        PolicyFlow(policy, env, rollout_buffer_class=buffer, **SMALL)  # type: ignore[arg-type]
+
+
+def test_learning_without_an_environment(tmp_path: Path) -> None:
+    PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"no environment to learn in: give one to load"):
+        PolicyFlow.load(tmp_path / "model").learn(16)
 
 
 def test_truncated_minibatches_are_announced() -> None:

@@ -286,6 +286,24 @@ def test_target_kl_stops_the_update() -> None:
     assert whole._n_updates == 10
 
 
+@pytest.mark.parametrize("lr_adaptation", ["epoch", "minibatch"])
+def test_update_that_is_stopped_lowers_the_learning_rate(lr_adaptation: str) -> None:
+    model = PolicyFlow(
+        "MlpPolicy",
+        "Pendulum-v1",
+        n_steps=256,
+        learning_rate=1e-2,
+        target_kl=1e-4,
+        desired_kl=5e-5,
+        lr_adaptation=lr_adaptation,
+        seed=0,
+    )
+    model.learn(256)
+    assert model._n_updates == 1
+    assert model.adaptive_learning_rate is not None
+    assert model.adaptive_learning_rate < 1e-2
+
+
 @pytest.mark.parametrize("off", [None, 0.0, -1.0])
 def test_gradient_clipping_can_be_turned_off(off: float | None) -> None:
     runs = []
