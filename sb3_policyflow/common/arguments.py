@@ -29,7 +29,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
         keep to ``learning_rate``.
     :param lr_adaptation: When the adaptive learning rate moves: after each "epoch" or "minibatch".
     :param lr_factor: By how much it moves.
-    :param lr_bounds: Its lowest and highest value.
+    :param lr_bounds: Its lowest and highest value; if it starts beyond, it only ever comes nearer.
     :param kl_margin: How far off ``desired_kl`` the divergence may be before it moves.
     :param kl_window: Mean of which divergences it follows at the end of an epoch: those of the
         "epoch", or all since the start of the "update".
@@ -186,8 +186,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
     def _start_adaptive_learning_rate(self) -> None:
         """Begin with ``learning_rate``, unless a saved run that began with it goes on.
 
-        :raises ValueError: If ``learning_rate`` is a schedule, which nothing would follow, or out
-            of its bounds.
+        :raises ValueError: If ``learning_rate`` is a schedule, which nothing would follow.
         """
         start = self.lr_schedule(1.0)
         if self.desired_kl is None:
@@ -196,11 +195,6 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
             raise ValueError(
                 "With desired_kl the learning rate follows the divergence of the policy: give the "
                 "learning_rate that it starts with, not a schedule."
-            )
-        elif not self.lr_bounds[0] <= start <= self.lr_bounds[1]:
-            raise ValueError(
-                f"With desired_kl the learning rate keeps within lr_bounds={self.lr_bounds}, but "
-                f"it starts at learning_rate={start}: change one of them."
             )
         elif self.adaptive_learning_rate is None or self._adaptive_start != start:
             self.adaptive_learning_rate = start

@@ -38,7 +38,8 @@ class KLAdaptiveLearningRate:
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
         """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""
-        lowest, highest = self.bounds
+        # Where it starts beyond its bounds, they must not turn "lower" into "higher".
+        lowest, highest = min(self.bounds[0], learning_rate), max(self.bounds[1], learning_rate)
         if kl > self.margin * desired_kl:
             return max(learning_rate / self.factor, lowest)
         if kl < desired_kl / self.margin:

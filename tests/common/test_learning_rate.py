@@ -14,6 +14,11 @@ RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))
         (6e-4, 0.0049, 9e-4),  # less than half the target
         (1.2e-4, 0.1, 1e-4),  # stops at the bounds
         (9e-4, 0.0, 1e-3),
+        (3e-3, 0.0, 3e-3),  # beyond them it only ever comes nearer
+        (3e-3, 0.1, 2e-3),
+        (1e-5, 0.1, 1e-5),
+        (1e-5, 0.0, 1.5e-5),
+        (0.0, 0.0, 0.0),
     ],
 )
 def test_rule(learning_rate: float, kl: float, expected: float) -> None:
