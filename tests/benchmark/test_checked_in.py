@@ -38,3 +38,10 @@ def test_pointmaze() -> None:
 def test_playground(task: str) -> None:
     env = f"Playground/{task}-v0"
     assert n_done("playground", playground.PANELS, 5, 3_000_000, env=env) == 15
+
+
+@pytest.mark.parametrize("task", ["ReacherEasy", "FingerTurnEasy", "BallInCup", "WalkerWalk"])
+def test_playground_held_out(task: str) -> None:
+    panels = {name: playground.PANELS[name] for name in ("policyflow", "ppo")}
+    env = f"Playground/{task}-v0"
+    assert n_done("playground-held-out", panels, 5, 3_000_000, env=env) == 6
