@@ -42,6 +42,7 @@ def test_playground(task: str) -> None:
 
 @pytest.mark.parametrize("task", ["ReacherEasy", "FingerTurnEasy", "BallInCup", "WalkerWalk"])
 def test_playground_held_out(task: str) -> None:
-    panels = {name: playground.PANELS[name] for name in ("policyflow", "ppo")}
+    names = ("policyflow", "policyflow-latent0.3", "ppo")
+    panels = {name: playground.PANELS[name] for name in names}
     env = f"Playground/{task}-v0"
-    assert n_done("playground-held-out", panels, 5, 3_000_000, env=env) == 6
+    assert n_done("playground-held-out", panels, 5, 3_000_000, env=env) == 9
