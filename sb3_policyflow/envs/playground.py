@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
 METADATA: Info = {"render_modes": ["rgb_array"]}
 
+STAGGER = "init_at_random_ep_len"
+"""The reset option of vectorised tasks."""
+
 FloatArray = NDArray[np.float32]
 
 
@@ -120,6 +123,10 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     ``step_tensors`` do the same with torch tensors that share JAX's memory, on a CPU or a GPU:
     only the flags of ended episodes are copied to the host.
 
+    ``reset(options={"init_at_random_ep_len": True})`` starts each environment at a random step of
+    its time limit, so that from then on their episodes end at different times (the option of this
+    name is RSL-RL's).
+
     :param task: name of the task, for instance ``"CheetahRun"``
     :param num_envs: number of environments
     :param render_mode: ``None`` or ``"rgb_array"``
@@ -150,8 +157,10 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
         self._camera = _camera(self.batch, render_mode)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        _refuse(options)
+        stagger = _pop_stagger(options)
         self._start(seed)
+        if stagger:
+            self.batch.stagger(self.np_random)
         return to_numpy(self.batch.state.obs), {}
 
     def step(
@@ -218,6 +227,9 @@ class PlaygroundVecEnv(GymVectorVecEnv):
     Where a task observes several things, for instance ``"state"`` and ``"privileged_state"``,
     observations are dictionaries; SB3's ``VecExtractDictObs`` leaves one of them.
 
+    ``set_options({"init_at_random_ep_len": True})`` is for the next ``reset`` alone, as are all
+    reset options in SB3.
+
     :param task: name of the task, for instance ``"CheetahRun"``
     :param num_envs: number of environments
     :param seed: seed of the first ``reset``; ``seed()`` sets another
@@ -261,6 +273,16 @@ def _refuse(options: Info | None) -> None:
         raise ValueError(
             f"Tasks of MuJoCo Playground start as they will: reset takes no options {options}."
         )
+
+
+def _pop_stagger(options: Info | None) -> bool:
+    """Whether ``init_at_random_ep_len`` is asked for; other options are refused."""
+    others = dict(options or {})
+    stagger = others.pop(STAGGER, False)
+    _refuse(others)
+    if not isinstance(stagger, bool):
+        raise ValueError(f"{STAGGER} must be True or False, got {stagger!r}.")
+    return stagger
 
 
 def _camera(batch: PlaygroundBatch, render_mode: str | None) -> Camera | None:

@@ -127,6 +127,10 @@ class PlaygroundBatch:
         self._state = self._draw_states(seed)
         self._steps[:] = 0
 
+    def stagger(self, generator: np.random.Generator) -> None:
+        """Put each environment at a random step of its episode, as far as its time limit goes."""
+        self._steps[:] = generator.integers(self.max_episode_steps, size=len(self._steps))
+
     def step(self, actions: Tree) -> None:
         """Advance all environments.
 

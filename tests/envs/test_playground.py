@@ -1,6 +1,7 @@
 """MuJoCo Playground's tasks against the engine itself. `make test-playground` runs these."""
 
 import importlib.metadata
+import itertools
 import os
 import subprocess
 import sys
@@ -125,6 +126,29 @@ def test_a_seed_repeats_and_another_differs(cartpoles):
     assert (once != other).any(axis=-1).all()
     unseeded = [cartpoles.reset()[0] for _ in range(2)]
     assert (unseeded[0] != unseeded[1]).any()
+
+
+def ends(env, n_steps):
+    """The steps, from 1, at which each environment's episodes end."""
+    dones = [env.step(np.zeros((N_ENVS, 1)))[2] for _ in range(n_steps)]
+    return [(np.flatnonzero(column) + 1).tolist() for column in np.array(dones).T]
+
+
+def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
+    env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
+    found = []
+    for seed in (0, 1, 2, 3, 4, 0):
+        env.seed(seed)
+        env.set_options({"init_at_random_ep_len": True})
+        env.reset()
+        found.append(ends(env, 2 * LIMIT))
+    assert found[0] == found[-1] != found[1]
+    firsts = [first for episodes in found for first, *_ in episodes]
+    assert set(firsts) == set(range(1, LIMIT + 1))
+    for first, second, *_ in itertools.chain.from_iterable(found):
+        assert second == first + LIMIT
+    env.reset()  # options are for one reset
+    assert ends(env, 2 * LIMIT) == [[LIMIT, 2 * LIMIT]] * N_ENVS
 
 
 def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
@@ -318,6 +342,8 @@ def test_bad_input_is_refused(cartpoles):
         cartpoles.step(np.zeros(N_ENVS))
     with pytest.raises(ValueError, match="takes no options"):
         cartpoles.reset(options={"position": 1})
+    with pytest.raises(ValueError, match="init_at_random_ep_len must be True or False, got 3"):
+        cartpoles.reset(options={"init_at_random_ep_len": 3})
     with pytest.raises(gym.error.NameNotFound, match="no task 'CheetaRun'; nearest: CheetahRun"):
         PlaygroundVecEnv("CheetaRun", 2)
     with pytest.raises(gym.error.NameNotFound, match="nearest: CheetahRun"):
