@@ -157,7 +157,7 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
         self._camera = _camera(self.batch, render_mode)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        stagger = _pop_stagger(options)
+        stagger = _wants_stagger(options)
         self._start(seed)
         if stagger:
             self.batch.stagger(self.np_random)
@@ -275,7 +275,7 @@ def _refuse(options: Info | None) -> None:
         )
 
 
-def _pop_stagger(options: Info | None) -> bool:
+def _wants_stagger(options: Info | None) -> bool:
     """Whether ``init_at_random_ep_len`` is asked for; other options are refused."""
     others = dict(options or {})
     stagger = others.pop(STAGGER, False)

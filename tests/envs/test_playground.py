@@ -1,7 +1,6 @@
 """MuJoCo Playground's tasks against the engine itself. `make test-playground` runs these."""
 
 import importlib.metadata
-import itertools
 import os
 import subprocess
 import sys
@@ -143,10 +142,9 @@ def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
         env.reset()
         found.append(ends(env, 2 * LIMIT))
     assert found[0] == found[-1] != found[1]
-    firsts = [first for episodes in found for first, *_ in episodes]
-    assert set(firsts) == set(range(1, LIMIT + 1))
-    for first, second, *_ in itertools.chain.from_iterable(found):
-        assert second == first + LIMIT
+    pairs = [(first, second) for episodes in found for first, second, *_ in episodes]
+    assert {first for first, _ in pairs} == set(range(1, LIMIT + 1))
+    assert all(second == first + LIMIT for first, second in pairs)
     env.reset()  # options are for one reset
     assert ends(env, 2 * LIMIT) == [[LIMIT, 2 * LIMIT]] * N_ENVS
 
