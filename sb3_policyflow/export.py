@@ -49,15 +49,15 @@ class NormalizeObservation(nn.Module):
         self.clip = float(normalize.clip_obs)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Normalised observations in single precision, of the same shape."""
-        normalised = (observations.double() - self.mean) / self.std
-        return normalised.clamp(-self.clip, self.clip).float()
+        """Normalized observations in single precision, of the same shape."""
+        normalized = (observations.double() - self.mean) / self.std
+        return normalized.clamp(-self.clip, self.clip).float()
 
 
 class ActionModule(nn.Module):
     """The way from observations to actions, as ``predict(deterministic=True)`` goes it from z = 0.
 
-    Normalisation, preprocessing, the steps of the flow or of the denoising chain one after another,
+    Normalization, preprocessing, the steps of the flow or of the denoising chain one after another,
     and the bounds of the actions: tensors in, tensors out, nothing drawn at random.
 
     :param policy: The policy, of which a copy is taken.
@@ -73,7 +73,7 @@ class ActionModule(nn.Module):
         super().__init__()
         self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
         self.policy.set_training_mode(False)
-        self.normalisers = nn.ModuleDict(_normalisers(self.policy.observation_space, normalize))
+        self.normalizers = nn.ModuleDict(_normalizers(self.policy.observation_space, normalize))
         box = self.policy.action_space
         assert isinstance(box, spaces.Box)
         self.register_buffer("low", th.as_tensor(box.low, dtype=th.float32))
@@ -88,7 +88,7 @@ class ActionModule(nn.Module):
             PolicyFlow's are of standard deviation ``latent_std``.
         :return: Actions within their bounds, shape (n, ...).
         """
-        features = self.policy.actor_features(self._normalised(observations))
+        features = self.policy.actor_features(self._normalized(observations))
         if latents is None:
             latents = features.new_zeros(features.shape[0], self.policy.action_dim)
         actions = self.policy.carry(latents, features).reshape(-1, *self.low.shape)
@@ -96,13 +96,13 @@ class ActionModule(nn.Module):
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return actions.clamp(self.low, self.high)
 
-    def _normalised(self, observations: Observations) -> Observations:
+    def _normalized(self, observations: Observations) -> Observations:
         if isinstance(observations, dict):
             return {
-                key: self.normalisers[key](values) if key in self.normalisers else values
+                key: self.normalizers[key](values) if key in self.normalizers else values
                 for key, values in observations.items()
             }
-        return self.normalisers["all"](observations) if self.normalisers else observations
+        return self.normalizers["all"](observations) if self.normalizers else observations
 
     def example(self, latents: bool = False) -> tuple[Any, ...]:
         """Arguments of :meth:`forward` for a batch of two.
@@ -119,13 +119,13 @@ class ActionModule(nn.Module):
         return observations, th.zeros(2, self.policy.action_dim)
 
     def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
-        """What the environment gives: normalised observations have been floats before."""
+        """What the environment gives: normalized observations have been floats before."""
         assert space.shape is not None
-        dtype = np.float32 if key in self.normalisers else space.dtype
+        dtype = np.float32 if key in self.normalizers else space.dtype
         return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype))
 
 
-def _normalisers(
+def _normalizers(
     space: spaces.Space[Any], normalize: VecNormalize | None
 ) -> dict[str, NormalizeObservation]:
     if normalize is None or not normalize.norm_obs:
@@ -151,7 +151,7 @@ def export(
     :param policy: The policy, ``model.policy``.
     :param path: The file, which ends in ".onnx" or ".pt2".
     :param normalize: The environment's ``VecNormalize``, if it has one: then the file takes
-        observations that are not normalised yet.
+        observations that are not normalized yet.
     :param latents: Whether latents z, shape (n, action_dim), are an input; they are 0 otherwise.
     :raises ValueError: If the file is to be of another kind.
     """

@@ -23,7 +23,7 @@ pytest.importorskip("onnxscript")
 
 EACH = pytest.mark.parametrize("algorithm", [PolicyFlow, FPO, DPPO])
 SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
-NETS = {"net_arch": [16], "embedding_dim": 8, "initialisation": "glorot"}
+NETS = {"net_arch": [16], "embedding_dim": 8, "initialization": "glorot"}
 STEPS: dict[type[Any], dict[str, Any]] = {
     PolicyFlow: {"n_flow_steps": 2, "solver": "midpoint"},
     FPO: {"n_flow_steps": 2, "solver": "heun"},
@@ -65,11 +65,11 @@ def trained(algorithm: type[Any], policy: str, env: VecEnv | str, **options: Any
     return algorithm(policy, env, policy_kwargs=NETS, seed=0, **options).learn(64)
 
 
-def raw_and_normalised(env: VecNormalize) -> tuple[Any, Any]:
+def raw_and_normalized(env: VecNormalize) -> tuple[Any, Any]:
     """Observations as the environment gives them, and as the policy sees them."""
     env.training = False
-    normalised = env.reset()
-    return env.get_original_obs(), normalised
+    normalized = env.reset()
+    return env.get_original_obs(), normalized
 
 
 def run_onnx(path: Path, observations: Any, **more: np.ndarray) -> np.ndarray:
@@ -84,8 +84,8 @@ def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 3))
     model = trained(algorithm, "MlpPolicy", env)
     export(model.policy, tmp_path / "policy.onnx", normalize=env)
-    raw, normalised = raw_and_normalised(env)
-    expected, _ = model.predict(normalised, deterministic=True)
+    raw, normalized = raw_and_normalized(env)
+    expected, _ = model.predict(normalized, deterministic=True)
     np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", raw), expected, atol=1e-5)
     one = run_onnx(tmp_path / "policy.onnx", raw[:1])
     np.testing.assert_allclose(one, expected[:1], atol=1e-5)
@@ -106,8 +106,8 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env(Robot, 3), norm_obs_keys=["joints"])
     model = trained(algorithm, "MultiInputPolicy", env)
     export(model.policy, tmp_path / "policy.onnx", normalize=env)
-    raw, normalised = raw_and_normalised(env)
-    expected, _ = model.predict(normalised, deterministic=True)
+    raw, normalized = raw_and_normalized(env)
+    expected, _ = model.predict(normalized, deterministic=True)
     raw["camera"] = raw["camera"].transpose(0, 3, 1, 2)
     raw = {key: values.astype(model.observation_space[key].dtype) for key, values in raw.items()}
     actions = run_onnx(tmp_path / "policy.onnx", raw)
@@ -181,7 +181,7 @@ def test_command_line_writes_files_that_load_without_this_package(
     model = trained(algorithm, "MlpPolicy", env)
     model.save(tmp_path / "model.zip")
     env.save(str(tmp_path / "stats.pkl"))
-    raw, normalised = raw_and_normalised(env)
+    raw, normalized = raw_and_normalized(env)
     np.save(tmp_path / "obs.npy", raw)
     output = tmp_path / f"policy.{kind}"
     stats = str(tmp_path / "stats.pkl")
@@ -189,7 +189,7 @@ def test_command_line_writes_files_that_load_without_this_package(
     subprocess.run(
         [sys.executable, "-c", WITHOUT_THIS_PACKAGE, kind], cwd=tmp_path, check=True, timeout=300
     )
-    expected, _ = model.predict(normalised, deterministic=True)
+    expected, _ = model.predict(normalized, deterministic=True)
     np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=1e-5)
 
 

@@ -122,7 +122,7 @@ def _archive(cell: Cell, folder: Path) -> Path:
 
 
 def _keep_trajectories(model: OnPolicyAlgorithm, cell: Cell, folder: Path) -> dict[str, Any]:
-    """Run episodes from the centre of MultiGoal, keep them, and say which goals they reached."""
+    """Run episodes from the center of MultiGoal, keep them, and say which goals they reached."""
     trajectories = sample_trajectories(model, cell.n_trajectories)
     report = goal_report(trajectories)
     np.savez_compressed(

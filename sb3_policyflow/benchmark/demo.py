@@ -22,7 +22,7 @@ EVALUATE_EVERY = 500_000
 
 
 class GoalsCallback(BaseCallback):
-    """Logs, from time to time, which goals are reached from the centre.
+    """Logs, from time to time, which goals are reached from the center.
 
     :param every: Environment steps between evaluations.
     """
@@ -86,7 +86,7 @@ def main(argv: list[str]) -> int:
     training_return = np.mean([episode["r"] for episode in model.ep_info_buffer])
     sys.stdout.write(
         f"After {model.num_timesteps:,} steps the training return is {training_return:.2f}.\n"
-        f"{N_TRAJECTORIES} stochastic trajectories from the centre: {goal_report(trajectories)}.\n"
+        f"{N_TRAJECTORIES} stochastic trajectories from the center: {goal_report(trajectories)}.\n"
         f"Pictures: {folder / 'trajectories.png'} and {folder / 'learning_curve.png'}.\n"
     )
     return 0

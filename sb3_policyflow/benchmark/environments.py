@@ -1,4 +1,4 @@
-"""Environment steps per second of the vectorised environments, as a training sees them.
+"""Environment steps per second of the vectorized environments, as a training sees them.
 
 Each is made as rl_zoo3 would make it, in one process, and takes random actions. The first reset and
 step, which may compile, are timed apart, and so is a later reset: an episode of 1000 steps costs
@@ -25,7 +25,7 @@ from sb3_policyflow.benchmark.results import ResultsError
 from sb3_policyflow.benchmark.speed import machine
 from sb3_policyflow.benchmark.table import markdown_table
 from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS, ensure_registered
-from sb3_policyflow.zoo.vector import has_own_vectorisation, make_native_vec_env
+from sb3_policyflow.integrations.rl_zoo3.vec_env import has_own_vectorization, make_native_vec_env
 
 DEFAULT_IDS = tuple(f"{PLAYGROUND}{task}-v0" for task in PLAYGROUND_TASKS)
 DEFAULT_SIZES = (64, 256, 1024)
@@ -61,7 +61,7 @@ def time_environment(env_id: str, num_envs: int, seconds: float) -> Timing:
     :raises gymnasium.error.Error: if it cannot be made
     """
     ensure_registered(env_id)
-    is_native = has_own_vectorisation(gym.spec(env_id))
+    is_native = has_own_vectorization(gym.spec(env_id))
     vec_env_cls: Any = make_native_vec_env if is_native else DummyVecEnv
     env = make_vec_env(env_id, num_envs, seed=0, vec_env_cls=vec_env_cls)
     actions = np.stack([env.action_space.sample() for _ in range(num_envs)])

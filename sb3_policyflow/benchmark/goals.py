@@ -1,8 +1,8 @@
 """How many of MultiGoal's six goals a policy reaches, and how evenly.
 
-From the centre of the workspace all goals are equally good, so an optimal policy that keeps all
+From the center of the workspace all goals are equally good, so an optimal policy that keeps all
 its options reaches each with probability 1/6. The paper shows this as a picture of 1000
-trajectories; here it is also a number, the normalised entropy over goals.
+trajectories; here it is also a number, the normalized entropy over goals.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
-from sb3_policyflow.envs.point_masses import (
+from sb3_policyflow.envs.multigoal.point_masses import (
     GOALS,
     MAX_EPISODE_STEPS,
     SUCCESS_RADIUS,
@@ -26,7 +26,7 @@ from sb3_policyflow.envs.point_masses import (
 )
 
 FloatArray = NDArray[np.float64]
-CENTRE = (0.0, 0.0)
+CENTER = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """What ``n`` episodes from the centre came to.
+    """What ``n`` episodes from the center came to.
 
     :param counts: episodes that ended at each goal
     :param n_missed: episodes that ended at none
-    :param entropy: ``normalised_entropy(counts)``
-    :param mean_return: mean sum of rewards (from the centre: not the training return, whose starts
+    :param entropy: ``normalized_entropy(counts)``
+    :param mean_return: mean sum of rewards (from the center: not the training return, whose starts
         are spread over the workspace)
     """
 
@@ -91,7 +91,7 @@ class GoalReport:
         counts = " ".join(map(str, self.counts))
         return (
             f"{self.n_goals} of {len(self.counts)} goals reached ({counts}; no goal: "
-            f"{self.n_missed}), normalised entropy {self.entropy:.2f}, "
+            f"{self.n_missed}), normalized entropy {self.entropy:.2f}, "
             f"mean return {self.mean_return:.2f}"
         )
 
@@ -99,9 +99,9 @@ class GoalReport:
 def sample_trajectories(
     model: PolicyPredictor, n: int = 1000, deterministic: bool = False, seed: int | None = 0
 ) -> Trajectories:
-    """Run ``n`` episodes that start at rest in the centre of the workspace.
+    """Run ``n`` episodes that start at rest in the center of the workspace.
 
-    If the model was trained under ``VecNormalize``, it sees observations normalised the same way.
+    If the model was trained under ``VecNormalize``, it sees observations normalized the same way.
 
     :param model: any SB3 algorithm, or another object with its ``predict``
     :param n: number of episodes
@@ -110,12 +110,12 @@ def sample_trajectories(
         ``None`` to go on from wherever they are
     """
     env = MultiGoalVecEnv(n, seed=seed)
-    env.set_options({"position": CENTRE})
-    normalise = _normaliser(model)
+    env.set_options({"position": CENTER})
+    normalize = _normalizer(model)
 
     def act(observations: NDArray[np.float32]) -> NDArray[np.float32]:
         actions: NDArray[np.float32] = model.predict(
-            normalise(observations), deterministic=deterministic
+            normalize(observations), deterministic=deterministic
         )[0]
         return actions
 
@@ -145,7 +145,7 @@ def _run_episodes(
     return Trajectories(positions, lengths, returns)
 
 
-def _normaliser(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+def _normalizer(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     vec_normalize: VecNormalize | None = getattr(model, "get_vec_normalize_env", lambda: None)()
     if vec_normalize is None:
         return lambda observations: observations
@@ -177,10 +177,10 @@ def goal_counts(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> N
     return np.bincount(goals[goals >= 0], minlength=len(GOALS))
 
 
-def normalised_entropy(counts: ArrayLike) -> float:
+def normalized_entropy(counts: ArrayLike) -> float:
     r"""Entropy of the shares over its greatest value, ``-sum p log p / log n``; 0 if all are 0.
 
-    >>> round(normalised_entropy([70, 72, 280, 136, 127, 87]), 2)
+    >>> round(normalized_entropy([70, 72, 280, 136, 127, 87]), 2)
     0.92
 
     :param counts: non-negative numbers, at least two
@@ -198,7 +198,7 @@ def goal_report(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> G
     return GoalReport(
         counts=tuple(counts.tolist()),
         n_missed=len(trajectories.lengths) - int(counts.sum()),
-        entropy=normalised_entropy(counts),
+        entropy=normalized_entropy(counts),
         mean_return=float(trajectories.returns.mean()),
     )
 

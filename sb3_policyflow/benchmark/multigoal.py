@@ -21,7 +21,7 @@ N_TRAJECTORIES = 1000
 HEADER = (
     "panel",
     "seeds",
-    "return from the centre",
+    "return from the center",
     "evaluation return",
     "goals of 6",
     "entropy",
@@ -58,7 +58,7 @@ PANELS = {
         PLAIN | {"ent_coef": 0.001},
     ),
     "f-brownian": Panel(
-        "(f) PolicyFlow, Brownian regulariser",
+        "(f) PolicyFlow, Brownian regularizer",
         "policyflow",
         PLAIN | {"brownian_coef": 0.2, "ent_coef": 0.001},
     ),
@@ -67,7 +67,7 @@ PANELS = {
 
 
 def load_trajectories(cell: Cell, folder: Path) -> Trajectories:
-    """The episodes from the centre that a cell kept."""
+    """The episodes from the center that a cell kept."""
     with np.load(cell.path(folder, ".npz")) as kept:
         positions = kept["positions"].astype(np.float64)
         return Trajectories(positions, kept["lengths"].astype(int), kept["returns"])

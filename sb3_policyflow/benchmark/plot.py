@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sb3_policyflow.benchmark.evaluation import DETERMINISTIC, LATENT_ONLY, STOCHASTIC
-from sb3_policyflow.benchmark.plots import DPI, GREY, SERIES_COLOURS, style_curves
+from sb3_policyflow.benchmark.plots import DPI, GRAY, SERIES_COLORS, style_curves
 from sb3_policyflow.benchmark.results import Result, ResultsError, distinct, load_results, select
 from sb3_policyflow.benchmark.run import DEFAULT_FOLDER
 from sb3_policyflow.benchmark.statistics import bootstrap_interval, interquartile_mean, score_matrix
@@ -33,22 +33,22 @@ def curves_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Figure:
     figure = Figure(figsize=(4.2 * n_columns, 3.2 * n_rows), dpi=DPI, layout="constrained")
     panels = np.ravel(figure.subplots(n_rows, n_columns, squeeze=False))
     for axes, env in zip(panels, envs, strict=False):
-        for name, colour in zip(names, _colours(len(names)), strict=True):
-            _draw_curve(axes, select(results, name, env), mode, colour)
+        for name, color in zip(names, _colors(len(names)), strict=True):
+            _draw_curve(axes, select(results, name, env), mode, color)
         style_curves(axes, env)
     for axes in panels[len(envs) :]:
         axes.set_visible(False)
     if len(names) > 1:
-        lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in _colours(len(names))]
+        lines = [Line2D([], [], color=color, linewidth=1.8) for color in _colors(len(names))]
         figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
     return figure
 
 
-def _colours(n_names: int) -> list[str]:
-    return [SERIES_COLOURS[i % len(SERIES_COLOURS)] for i in range(n_names)]
+def _colors(n_names: int) -> list[str]:
+    return [SERIES_COLORS[i % len(SERIES_COLORS)] for i in range(n_names)]
 
 
-def _draw_curve(axes: Axes, runs: Sequence[Result], mode: str, colour: str) -> None:
+def _draw_curve(axes: Axes, runs: Sequence[Result], mode: str, color: str) -> None:
     curves = [run.returns(mode) for run in runs]
     curves = [curve for curve in curves if curve[0]]
     if not curves:
@@ -62,10 +62,10 @@ def _draw_curve(axes: Axes, runs: Sequence[Result], mode: str, colour: str) -> N
         )
     points = [score_matrix([list(scores)]) for scores in zip(*(c[1] for c in curves), strict=True)]
     intervals = np.array([bootstrap_interval(interquartile_mean, scores) for scores in points])
-    axes.plot(timesteps, intervals[:, 0], color=colour, linewidth=1.8, label=runs[0].cell.name)
+    axes.plot(timesteps, intervals[:, 0], color=color, linewidth=1.8, label=runs[0].cell.name)
     if len(curves) > 1:
         axes.fill_between(
-            timesteps, intervals[:, 1], intervals[:, 2], color=colour, alpha=0.18, linewidth=0
+            timesteps, intervals[:, 1], intervals[:, 2], color=color, alpha=0.18, linewidth=0
         )
 
 
@@ -79,10 +79,10 @@ def improvement_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Fig
     figure = Figure(figsize=(5.6, 0.7 + 0.4 * len(pairs)), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     for place, (label, interval) in enumerate(reversed(pairs)):
-        axes.plot([interval.low, interval.high], [place, place], color=GREY, linewidth=6)
-        axes.plot(interval.estimate, place, "o", color=SERIES_COLOURS[0], clip_on=False)
+        axes.plot([interval.low, interval.high], [place, place], color=GRAY, linewidth=6)
+        axes.plot(interval.estimate, place, "o", color=SERIES_COLORS[0], clip_on=False)
         axes.text(-0.02, place, label, ha="right", va="center", fontsize=8, color=INK)
-    axes.axvline(0.5, color=GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+    axes.axvline(0.5, color=GRAY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
     axes.set(xlim=(0, 1), ylim=(-0.6, len(pairs) - 0.4), yticks=[])
     axes.set_xlabel("probability of improvement", fontsize=9, color=INK)
     axes.spines[["left", "top", "right"]].set_visible(False)

@@ -20,23 +20,23 @@ from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from sb3_policyflow.benchmark.goals import Trajectories, goal_report
-from sb3_policyflow.envs.drawing import GOAL_COLOURS, INK
-from sb3_policyflow.envs.point_masses import GOALS, WALL
+from sb3_policyflow.envs.drawing import GOAL_COLORS, INK
+from sb3_policyflow.envs.multigoal.point_masses import GOALS, WALL
 
 FloatArray = NDArray[np.float64]
 
-GREY = "#9aa0a8"
+GRAY = "#9aa0a8"
 PALE = "#d9dce1"
 # Okabe and Ito's palette in the order in which it separates best on white.
-SERIES_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MONITOR_WINDOW = 100
 DPI = 160
 
 
 def draw_trajectories(axes: Axes, trajectories: Trajectories) -> None:
-    """Draw the workspace, its goals and each trajectory in the colour of the goal it ended at."""
+    """Draw the workspace, its goals and each trajectory in the color of the goal it ended at."""
     reached = trajectories.goals()
-    palette = np.array([*(to_rgba(colour) for colour in GOAL_COLOURS), to_rgba(GREY)])
+    palette = np.array([*(to_rgba(color) for color in GOAL_COLORS), to_rgba(GRAY)])
     opacity = float(np.clip(60 / len(reached), 0.12, 0.8))
     for goal in range(-1, len(GOALS)):
         lines = trajectories.positions[reached == goal]
@@ -56,7 +56,7 @@ def _draw_workspace(axes: Axes) -> None:
     wall = Rectangle((-WALL, -WALL), 2 * WALL, 2 * WALL, fill=False, edgecolor=PALE, linewidth=1.2)
     axes.add_patch(wall)
     axes.scatter(
-        GOALS[:, 0], GOALS[:, 1], s=70, c=GOAL_COLOURS, edgecolors="white", linewidths=1.4, zorder=3
+        GOALS[:, 0], GOALS[:, 1], s=70, c=GOAL_COLORS, edgecolors="white", linewidths=1.4, zorder=3
     )
     axes.scatter(0, 0, s=16, color=INK, edgecolors="white", linewidths=0.8, zorder=3)
     axes.set(xlim=(-WALL - 0.3, WALL + 0.3), ylim=(-WALL - 0.3, WALL + 0.3), aspect="equal")
@@ -64,14 +64,14 @@ def _draw_workspace(axes: Axes) -> None:
 
 
 def draw_goal_counts(axes: Axes, trajectories: Trajectories) -> None:
-    """Draw a bar for each goal's number of trajectories, in its colour; dashed: all alike."""
+    """Draw a bar for each goal's number of trajectories, in its color; dashed: all alike."""
     report = goal_report(trajectories)
     n = len(trajectories.lengths)
     places = range(len(GOALS))
-    axes.bar(places, report.counts, color=GOAL_COLOURS, width=0.72)
+    axes.bar(places, report.counts, color=GOAL_COLORS, width=0.72)
     axes.set_xticks(places, [str(count) for count in report.counts])
     axes.tick_params(length=0, labelsize=7.5, labelcolor=INK, pad=2)
-    axes.axhline(n / len(GOALS), color=GREY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+    axes.axhline(n / len(GOALS), color=GRAY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
     axes.set(ylim=(0, 1.08 * max(n / len(GOALS), *report.counts)), yticks=[])
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.spines["bottom"].set_color(PALE)
@@ -120,7 +120,7 @@ def learning_curve_figure(
     for i, (name, files) in enumerate(runs.items()):
         paths = [files] if isinstance(files, str | Path) else files
         curves = [read_learning_curve(path) for path in paths]
-        _draw_curves(axes, name, curves, SERIES_COLOURS[i % len(SERIES_COLOURS)])
+        _draw_curves(axes, name, curves, SERIES_COLORS[i % len(SERIES_COLORS)])
     style_curves(axes, title)
     if len(runs) > 1:
         axes.legend(frameon=False, fontsize=8, labelcolor=INK)
@@ -128,16 +128,16 @@ def learning_curve_figure(
 
 
 def _draw_curves(
-    axes: Axes, name: str, curves: Sequence[tuple[FloatArray, FloatArray]], colour: str
+    axes: Axes, name: str, curves: Sequence[tuple[FloatArray, FloatArray]], color: str
 ) -> None:
     end = min(steps[-1] for steps, _ in curves)
     start = max(steps[0] for steps, _ in curves)
     grid = np.linspace(start, end, 400)
     returns = np.stack([np.interp(grid, *curve) for curve in curves])
-    axes.plot(grid, returns.mean(axis=0), color=colour, linewidth=1.8, label=name)
+    axes.plot(grid, returns.mean(axis=0), color=color, linewidth=1.8, label=name)
     if len(curves) > 1:
         low, high = returns.min(axis=0), returns.max(axis=0)
-        axes.fill_between(grid, low, high, color=colour, alpha=0.18, linewidth=0)
+        axes.fill_between(grid, low, high, color=color, alpha=0.18, linewidth=0)
 
 
 def style_curves(axes: Axes, title: str) -> None:

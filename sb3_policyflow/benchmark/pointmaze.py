@@ -1,4 +1,4 @@
-"""The paper's exploration maps: where in the maze three trainings go, on one colour scale.
+"""The paper's exploration maps: where in the maze three trainings go, on one color scale.
 
 Trains what is missing, with every seed; draws the mean maps to ``pointmaze.png`` and writes their
 numbers to ``pointmaze.md``.

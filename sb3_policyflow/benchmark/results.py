@@ -30,7 +30,7 @@ class Cell:
     :param hyperparams: What differs from the YAML file.
     :param n_evaluations: Evaluations, evenly over the training, the last one at its end.
     :param n_episodes: Episodes of an evaluation, in each mode.
-    :param n_trajectories: MultiGoal episodes from the centre to keep; 0 for none.
+    :param n_trajectories: MultiGoal episodes from the center to keep; 0 for none.
     :param keep_visits: Whether to count where in the medium maze the training goes.
     """
 

@@ -2,7 +2,7 @@
 
 The paper shows maps of all training episodes; here they come with the share of the free space that
 was visited, and the entropy of the visits relative to a uniform density. Both are over square cells
-of side ``CELL_SIZE``, of which each free cell of the maze has 16; the ball's centre can reach all.
+of side ``CELL_SIZE``, of which each free cell of the maze has 16; the ball's center can reach all.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_policyflow.benchmark.goals import normalised_entropy
+from sb3_policyflow.benchmark.goals import normalized_entropy
 from sb3_policyflow.benchmark.plots import DPI
-from sb3_policyflow.envs.drawing import GOAL_COLOURS, INK, MARGIN
-from sb3_policyflow.envs.point_maze import GOAL_CELLS, START_CELL, cell_centre, medium_maze
+from sb3_policyflow.envs.drawing import GOAL_COLORS, INK, MARGIN
+from sb3_policyflow.envs.point_maze import GOAL_CELLS, START_CELL, cell_center, medium_maze
 
 FloatArray = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ CELLS_PER_SIDE = 4
 CELL_SIZE = 1.0 / CELLS_PER_SIDE
 SCALE_LIMITS = (0.01, 100.0)
 SCALE = LogNorm(*SCALE_LIMITS)
-COLOURS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="white")
+COLORS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="white")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class VisitMap:
     @property
     def entropy(self) -> float:
         """Entropy of the visits over the free cells, relative to that of a uniform density."""
-        return normalised_entropy(self.counts[self.free])
+        return normalized_entropy(self.counts[self.free])
 
     @property
     def density(self) -> FloatArray:
@@ -96,12 +96,12 @@ class VisitCounter(BaseCallback):
 
     def _last_positions(self) -> FloatArray:
         """Where the step ended, before any reset, shape ``(num_envs, 2)``."""
-        normaliser = self.model.get_vec_normalize_env()
-        raw = normaliser.get_original_obs() if normaliser else self.locals["new_obs"]
+        normalizer = self.model.get_vec_normalize_env()
+        raw = normalizer.get_original_obs() if normalizer else self.locals["new_obs"]
         positions = _positions(raw).copy()
         for i in np.flatnonzero(self.locals["dones"]):
             last = self.locals["infos"][i]["terminal_observation"]
-            positions[i] = _positions(normaliser.unnormalize_obs(last) if normaliser else last)
+            positions[i] = _positions(normalizer.unnormalize_obs(last) if normalizer else last)
         return positions
 
     def _count(self, positions: FloatArray) -> None:
@@ -118,7 +118,7 @@ def _positions(observations: Any) -> FloatArray:
 
 
 def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
-    """The maze for each run, coloured by visits on one common scale, with the two numbers below.
+    """The maze for each run, colored by visits on one common scale, with the two numbers below.
 
     Several maps of one name are its seeds: their mean density, and the means of their numbers.
 
@@ -134,7 +134,7 @@ def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
         label = f"visited {coverage:.1%}   entropy {entropy:.2f}"
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_xlabel(label, fontsize=8, color=INK)
-    bar = figure.colorbar(ScalarMappable(SCALE, COLOURS), ax=panels, shrink=0.75, aspect=24)
+    bar = figure.colorbar(ScalarMappable(SCALE, COLORS), ax=panels, shrink=0.75, aspect=24)
     bar.set_label("visits relative to uniform", fontsize=8, color=INK)
     bar.ax.tick_params(which="both", labelsize=7, labelcolor=INK, length=0)
     bar.outline.set_visible(False)
@@ -142,11 +142,11 @@ def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
 
 
 def _draw_density(axes: Axes, density: FloatArray) -> None:
-    """Walls grey, unvisited cells white; what is off the scale gets its nearest colour."""
+    """Walls gray, unvisited cells white; what is off the scale gets its nearest color."""
     visited = density.clip(*SCALE_LIMITS)
     shown = np.where(density > 0, visited, np.where(np.isnan(density), np.nan, 1e-9))
     half = len(density) * CELL_SIZE / 2
-    axes.imshow(shown, COLOURS, SCALE, extent=(-half, half, -half, half), interpolation="nearest")
+    axes.imshow(shown, COLORS, SCALE, extent=(-half, half, -half, half), interpolation="nearest")
     _draw_marks(axes)
     inside = half - 0.75
     axes.set(xlim=(-inside, inside), ylim=(-inside, inside), xticks=[], yticks=[])
@@ -155,9 +155,9 @@ def _draw_density(axes: Axes, density: FloatArray) -> None:
 
 def _draw_marks(axes: Axes) -> None:
     maze = medium_maze()
-    goals = np.array([cell_centre(cell, maze) for cell in GOAL_CELLS])
-    start = cell_centre(START_CELL, maze)
-    for points, colour in ((goals, GOAL_COLOURS[4]), (start[None], GOAL_COLOURS[2])):
+    goals = np.array([cell_center(cell, maze) for cell in GOAL_CELLS])
+    start = cell_center(START_CELL, maze)
+    for points, color in ((goals, GOAL_COLORS[4]), (start[None], GOAL_COLORS[2])):
         axes.scatter(
-            points[:, 0], points[:, 1], s=52, color=colour, edgecolors="white", linewidths=1.3
+            points[:, 0], points[:, 1], s=52, color=color, edgecolors="white", linewidths=1.3
         )

@@ -10,11 +10,11 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.collection import CollectionMixin
 from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
 from sb3_policyflow.common.policies import FlowActorCriticPolicy, check_flow_spaces
-from sb3_policyflow.common.saving import SavingMixin
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
+from sb3_policyflow.resilience.collection import CollectionMixin
+from sb3_policyflow.resilience.saving import SavingMixin
 
 
 class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
@@ -33,7 +33,7 @@ class FlowAlgorithmArguments(SavingMixin, CollectionMixin):
     :param kl_margin: How far off ``desired_kl`` the divergence may be before it moves.
     :param kl_window: Mean of which divergences it follows at the end of an epoch: those of the
         "epoch", or all since the start of the "update".
-    :param advantage_scope: Where advantages are normalised: in each "minibatch", as SB3 does, or
+    :param advantage_scope: Where advantages are normalized: in each "minibatch", as SB3 does, or
         over the whole "rollout".
     :param timeout_bootstrap: The value that an episode cut by a time limit goes on with: that of
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".

@@ -144,13 +144,13 @@ def choose_buffer_class(
 def check_batches(batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool) -> None:
     """Refuse sizes that SB3's PPO refuses, and warn of those it warns of.
 
-    :raises ValueError: If advantages would be normalised over one sample.
+    :raises ValueError: If advantages would be normalized over one sample.
     """
     buffer_size = n_steps * n_envs
     check_count("batch_size", batch_size, 2 if normalize_advantage else 1)
     if normalize_advantage and buffer_size < 2:
         raise ValueError(
-            "Advantages cannot be normalised over one sample: n_steps * n_envs must be greater "
+            "Advantages cannot be normalized over one sample: n_steps * n_envs must be greater "
             f"than 1, got n_steps={n_steps} and n_envs={n_envs}."
         )
     if buffer_size % batch_size > 0:

@@ -12,15 +12,15 @@ SMALLEST_DISTANCE = 1e-6
 """Actions nearer than this count as this far apart: clipped ones may coincide."""
 
 
-def nearest_neighbour_entropy(samples: th.Tensor) -> th.Tensor:
-    """Differential entropy from the distances of samples to their nearest neighbours.
+def nearest_neighbor_entropy(samples: th.Tensor) -> th.Tensor:
+    """Differential entropy from the distances of samples to their nearest neighbors.
 
     H = psi(m) - psi(1) + log V_d + d / m sum_i log r_i    (Kozachenko and Leonenko, 1987)
 
     with V_d the volume of the unit ball. It has a gradient for samples that have one.
 
     >>> uniform = th.rand(1000, 32, 1, generator=th.Generator().manual_seed(0))
-    >>> abs(nearest_neighbour_entropy(4 * uniform).item() - math.log(4)) < 0.05
+    >>> abs(nearest_neighbor_entropy(4 * uniform).item() - math.log(4)) < 0.05
     True
 
     :param samples: m samples from each of n distributions, shape (n, m, d) with m of at least 2.
@@ -44,7 +44,7 @@ def action_entropy(policy: FlowActorCriticPolicy, features: th.Tensor, n_actions
     :param n_actions: How many to draw in each, at least 2.
     """
     actions, _ = policy.sample_actions(features.repeat_interleave(n_actions, dim=0))
-    return nearest_neighbour_entropy(actions.reshape(len(features), n_actions, -1))
+    return nearest_neighbor_entropy(actions.reshape(len(features), n_actions, -1))
 
 
 class SampledEntropyMixin(FlowOnPolicyAlgorithm):

@@ -55,7 +55,7 @@ def gaussian_kl(shift: th.Tensor, log_std: th.Tensor, old_log_std: th.Tensor) ->
 
 
 def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
-    """Entropy of the Gaussian noise (paper, second term of the entropy regulariser).
+    """Entropy of the Gaussian noise (paper, second term of the entropy regularizer).
 
     1/2 sum_i log(2 pi e sigma_i^2)
 
@@ -68,7 +68,7 @@ def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
 def clipped_surrogate(
     log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
 ) -> th.Tensor:
-    """PPO's clipped objective for each sample, to be maximised (paper, J^Flow).
+    """PPO's clipped objective for each sample, to be maximized (paper, J^Flow).
 
     min(rho A, clip(rho, 1 - epsilon, 1 + epsilon) A)
 
@@ -90,14 +90,14 @@ def _clamp(values: th.Tensor, low: Any, high: Any) -> th.Tensor:
     return values.clamp(low, high)
 
 
-def penalised_surrogate(
+def penalized_surrogate(
     log_ratio: th.Tensor, advantages: th.Tensor, clip_range: float | th.Tensor
 ) -> th.Tensor:
-    """SPO's objective for each sample, to be maximised (Xie et al., 2025).
+    """SPO's objective for each sample, to be maximized (Xie et al., 2025).
 
     rho A - |A| / (2 epsilon) (rho - 1)^2,    greatest at rho = 1 + epsilon sign(A)
 
-    >>> penalised_surrogate(th.tensor(2.0).log(), th.tensor([1.0, -1.0]), 0.5)
+    >>> penalized_surrogate(th.tensor(2.0).log(), th.tensor([1.0, -1.0]), 0.5)
     tensor([ 1., -3.])
 
     Takes and returns the shapes of :func:`clipped_surrogate`.
@@ -119,12 +119,12 @@ def asymmetric_surrogate(
     Takes and returns the shapes of :func:`clipped_surrogate`.
     """
     arguments = log_ratio, advantages, clip_range
-    return th.where(advantages < 0, penalised_surrogate(*arguments), clipped_surrogate(*arguments))
+    return th.where(advantages < 0, penalized_surrogate(*arguments), clipped_surrogate(*arguments))
 
 
 SURROGATES: dict[str, Callable[[th.Tensor, th.Tensor, float | th.Tensor], th.Tensor]] = {
     "ppo": clipped_surrogate,
-    "spo": penalised_surrogate,
+    "spo": penalized_surrogate,
     "aspo": asymmetric_surrogate,
 }
 """Objectives that keep the policy near the old one, by the name of their trust region."""

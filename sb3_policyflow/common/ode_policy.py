@@ -11,7 +11,7 @@ from sb3_policyflow.common.policies import FlowActorCriticPolicy
 from sb3_policyflow.flows import SOLVERS, Path
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.solvers import solver_times
-from sb3_policyflow.fused.sampler import FlowSampler
+from sb3_policyflow.kernels.sampler import FlowSampler
 
 
 class OdeFlowPolicy(FlowActorCriticPolicy):

@@ -12,7 +12,7 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 from sb3_policyflow.common.arguments import FlowAlgorithmArguments
 from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.metrics import UpdateMetrics
-from sb3_policyflow.common.optimisation import clip_gradients
+from sb3_policyflow.common.optimization import clip_gradients
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 
 
@@ -29,22 +29,22 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
     # What siblings supply
 
     @abstractmethod
-    def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Any:
+    def _behavior(self, rollout: FlowRolloutBufferSamples) -> Any:
         """What the update must know of the policy that made the rollout, before it changes."""
 
     @abstractmethod
-    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Any) -> Any:
+    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behavior: Any) -> Any:
         """What an epoch draws anew for each sample: a NamedTuple of tensors (n, ...)."""
 
     @abstractmethod
     def _policy_terms(
-        self, batch: FlowRolloutBufferSamples, features: th.Tensor, behaviour: Any
+        self, batch: FlowRolloutBufferSamples, features: th.Tensor, behavior: Any
     ) -> PolicyTerms:
         """The terms of the policy loss.
 
         :param batch: A minibatch of n samples, with their probes.
         :param features: The actor's features, shape (n, features_dim).
-        :param behaviour: What :meth:`_behaviour` returned.
+        :param behavior: What :meth:`_behavior` returned.
         """
 
     # The update
@@ -53,15 +53,15 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         """Update the policy with the rollout in the buffer (paper, algorithm 1, second half)."""
         rollout = self._rollout()
         self.policy.set_training_mode(False)
-        behaviour = self._behaviour(rollout)
+        behavior = self._behavior(rollout)
         self._update_learning_rate(self.policy.optimizer)
         metrics, divergences = UpdateMetrics(), list[th.Tensor]()
         for _ in range(self.n_epochs):
             if self.kl_window == "epoch":
                 divergences.clear()
-            probes = self._draw_probes(rollout, behaviour)
+            probes = self._draw_probes(rollout, behavior)
             finished = self._train_epoch(
-                rollout._replace(probes=probes), behaviour, metrics, divergences
+                rollout._replace(probes=probes), behavior, metrics, divergences
             )
             self._n_updates += 1
             if not finished:
@@ -69,16 +69,16 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         self._log_update(metrics, th.stack(divergences).mean().item())
 
     def _rollout(self) -> FlowRolloutBufferSamples:
-        """The rollout, with advantages normalised if that is done over all of it."""
+        """The rollout, with advantages normalized if that is done over all of it."""
         rollout = self.rollout_buffer.samples()
         if self.normalize_advantage and self.advantage_scope == "rollout":
-            return rollout._replace(advantages=_normalised(rollout.advantages))
+            return rollout._replace(advantages=_normalized(rollout.advantages))
         return rollout
 
     def _train_epoch(
         self,
         rollout: FlowRolloutBufferSamples,
-        behaviour: Any,
+        behavior: Any,
         metrics: UpdateMetrics,
         divergences: list[th.Tensor],
     ) -> bool:
@@ -86,7 +86,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         self.policy.set_training_mode(True)
         parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.minibatches(rollout, self.batch_size):
-            loss, kl, figures = self._loss(batch, behaviour)
+            loss, kl, figures = self._loss(batch, behavior)
             metrics.add(figures)
             divergences.append(kl.detach())
             if self.target_kl is not None and kl.item() > 1.5 * self.target_kl:
@@ -95,7 +95,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
                 # The epoch has no end to adapt at, and this is what is wrong with the rate.
                 self._adapt_learning_rate(divergences[-1:])
                 return False
-            self._optimise(loss, parameters)
+            self._optimize(loss, parameters)
             if self.lr_adaptation == "minibatch":
                 self._adapt_learning_rate(divergences[-1:])
         if self.lr_adaptation == "epoch":
@@ -103,14 +103,14 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         return True
 
     def _loss(
-        self, batch: FlowRolloutBufferSamples, behaviour: Any
+        self, batch: FlowRolloutBufferSamples, behavior: Any
     ) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         """The loss of a minibatch, the divergence of the policy, and figures to log."""
         actor_features, critic_features = self._features(batch)
-        terms = self._policy_terms(batch, actor_features, behaviour)
+        terms = self._policy_terms(batch, actor_features, behavior)
         policy_loss = -self._surrogate(terms.log_ratio, self._advantages(batch)).mean()
         value_loss = self._value_loss(batch, self.policy.values(critic_features).flatten())
-        loss = policy_loss + terms.regulariser + self.vf_coef * value_loss
+        loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
         figures = {
             "policy_gradient_loss": policy_loss,
             "value_loss": value_loss,
@@ -129,7 +129,7 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
         per_minibatch = self.normalize_advantage and self.advantage_scope == "minibatch"
         # A minibatch of one sample has no standard deviation.
         if per_minibatch and len(batch.advantages) > 1:
-            return _normalised(batch.advantages)
+            return _normalized(batch.advantages)
         return batch.advantages
 
     def _surrogate(self, log_ratio: th.Tensor, advantages: th.Tensor) -> th.Tensor:
@@ -159,8 +159,8 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             "log_ratio_max": log_ratio.abs().max(),
         }
 
-    def _optimise(self, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:
-        """Take one step of the optimiser.
+    def _optimize(self, loss: th.Tensor, parameters: list[th.nn.Parameter]) -> None:
+        """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters are left alone.
         """
@@ -202,5 +202,5 @@ class FlowOnPolicyAlgorithm(FlowAlgorithmArguments):
             self.logger.record("train/clip_range_vf", self._now(self.clip_range_vf))
 
 
-def _normalised(advantages: th.Tensor) -> th.Tensor:
+def _normalized(advantages: th.Tensor) -> th.Tensor:
     return (advantages - advantages.mean()) / (advantages.std() + 1e-8)

@@ -19,10 +19,10 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_policyflow.common.optimisation import make_optimizer
-from sb3_policyflow.fused.fields import FusedVelocityField
-from sb3_policyflow.fused.networks import Perceptron, Reader, Reading, is_eager
-from sb3_policyflow.fused.perceptron import evaluate_perceptron
+from sb3_policyflow.common.optimization import make_optimizer
+from sb3_policyflow.kernels.fields import FusedVelocityField
+from sb3_policyflow.kernels.networks import Perceptron, Reader, Reading, is_eager
+from sb3_policyflow.kernels.perceptron import evaluate_perceptron
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -39,8 +39,8 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param net_arch: Hidden layers of the velocity field (``pi``) and of the critic (``vf``).
         Default: [64, 64] for both, and none for the critic behind a ``NatureCNN``.
     :param activation_fn: Activation of both networks.
-    :param ortho_init: Whether to initialise features extractor and critic orthogonally, as SB3
-        does. The velocity field has its own ``initialisation``.
+    :param ortho_init: Whether to initialize features extractor and critic orthogonally, as SB3
+        does. The velocity field has its own ``initialization``.
     :param use_sde: Not supported.
     :param features_extractor_class: Features extractor.
     :param features_extractor_kwargs: Keyword arguments of the features extractor.
@@ -51,7 +51,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param embedding_dim: Size of the time and observation embeddings.
     :param frequencies: Frequencies of the time embedding, or how many to draw.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
-    :param initialisation: "glorot", "glorot_zero_output" or "zero".
+    :param initialization: "glorot", "glorot_zero_output" or "zero".
     :param random_latents: Whether ``predict(deterministic=True)`` draws the latents and leaves out
         the noise only. May be set later.
     :raises ValueError: If an option is not supported.
@@ -62,7 +62,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         "embedding_dim",
         "frequencies",
         "frequency_scale",
-        "initialisation",
+        "initialization",
         "random_latents",
     )
     """Constructor arguments that SB3's ``save`` of a policy does not know of."""
@@ -87,14 +87,14 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         embedding_dim: int = 64,
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
-        initialisation: str = "glorot_zero_output",
+        initialization: str = "glorot_zero_output",
         random_latents: bool = False,
     ) -> None:
         check_flow_spaces(action_space, use_sde)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
-        self.initialisation = initialisation
+        self.initialization = initialization
         self.random_latents = random_latents
         if net_arch is None and features_extractor_class is NatureCNN:
             # SB3 puts no layer behind its CNN, but a velocity without one is linear in the action.
@@ -159,7 +159,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             embedding_dim=self.embedding_dim,
             frequencies=self.frequencies,
             frequency_scale=self.frequency_scale,
-            initialisation=self.initialisation,
+            initialization=self.initialization,
         )
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
@@ -233,7 +233,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         return actions.reshape(-1, *self.action_space.shape)
 
     def keep_within_bounds(self) -> None:
-        """Put parameters that have bounds back into them, after a step of the optimiser."""
+        """Put parameters that have bounds back into them, after a step of the optimizer."""
 
     def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
         """Refuse: SB3's distributions say how likely actions are."""

@@ -29,13 +29,13 @@ class PolicyTerms(NamedTuple):
     """What an algorithm's policy loss is made of, for one minibatch of n samples.
 
     ``log_ratio`` has shape (n, ...), with one entry for each surrogate; ``kl`` has no dimensions
-    and measures the change of the policy in nats; ``regulariser`` is added to the loss;
+    and measures the change of the policy in nats; ``regularizer`` is added to the loss;
     ``metrics`` are logged under ``train/``.
     """
 
     log_ratio: th.Tensor
     kl: th.Tensor
-    regulariser: th.Tensor
+    regularizer: th.Tensor
     metrics: dict[str, th.Tensor]
 
 

@@ -197,10 +197,10 @@ class DPPO(SampledEntropyMixin):
         if self.log_prob_clamp is not None:
             checks.check_bounds("log_prob_clamp", self.log_prob_clamp)
 
-    def _behaviour(self, rollout: FlowRolloutBufferSamples) -> None:
+    def _behavior(self, rollout: FlowRolloutBufferSamples) -> None:
         """Nothing: the record has the old means."""
 
-    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: None) -> tuple[()]:  # noqa: ARG002
+    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behavior: None) -> tuple[()]:  # noqa: ARG002
         """Nothing: every epoch looks at all trained steps."""
         return ()
 
@@ -208,19 +208,19 @@ class DPPO(SampledEntropyMixin):
         self,
         batch: FlowRolloutBufferSamples,
         features: th.Tensor,
-        behaviour: None,  # noqa: ARG002
+        behavior: None,  # noqa: ARG002
     ) -> PolicyTerms:
         """Ratios of the trained denoising steps (DPPO, policy gradient of the two-layer MDP)."""
         record: DPPORecord = batch.record
         means = self.policy.trained_means(record.points[:, :-1], features)
         change = (means - record.means) / self.policy.log_prob_stds.unsqueeze(-1)
         log_ratio = self._log_probs(record, means) - self._log_probs(record, record.means)
-        regulariser, figures = self._entropy_bonus(features)
+        regularizer, figures = self._entropy_bonus(features)
         # The divergence of the chains, given the points that they start their steps from.
         divergence = 0.5 * change.square().sum(dim=(-2, -1)).mean()
         if self._is_critic_warming_up:
-            log_ratio, regulariser = log_ratio.detach(), regulariser.detach()
-        return PolicyTerms(log_ratio, divergence, regulariser, figures)
+            log_ratio, regularizer = log_ratio.detach(), regularizer.detach()
+        return PolicyTerms(log_ratio, divergence, regularizer, figures)
 
     def _features(self, batch: FlowRolloutBufferSamples) -> tuple[th.Tensor, th.Tensor]:
         actor_features, critic_features = super()._features(batch)

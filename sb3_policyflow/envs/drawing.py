@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
-# Okabe and Ito's palette, told apart by colour-blind readers too; one colour for each goal.
-GOAL_COLOURS: tuple[Colour, ...] = (
+# Okabe and Ito's palette, told apart by color-blind readers too; one color for each goal.
+GOAL_COLORS: tuple[Color, ...] = (
     (0.00, 0.45, 0.70),
     (0.90, 0.62, 0.00),
     (0.00, 0.62, 0.45),
@@ -20,8 +20,8 @@ GOAL_COLOURS: tuple[Colour, ...] = (
     (0.84, 0.37, 0.00),
     (0.34, 0.71, 0.91),
 )
-INK: Colour = (0.13, 0.15, 0.19)
-MARGIN: Colour = (0.88, 0.89, 0.91)
+INK: Color = (0.13, 0.15, 0.19)
+MARGIN: Color = (0.88, 0.89, 0.91)
 
 
 class Canvas:
@@ -37,12 +37,12 @@ class Canvas:
         self.image: FloatArray = np.ones((size, size, 3))
 
     def pixel(self, point: ArrayLike) -> FloatArray:
-        """Column and row of a point of the plane, pixel centres at whole numbers."""
+        """Column and row of a point of the plane, pixel centers at whole numbers."""
         x, y = np.asarray(point, dtype=np.float64)
         return np.array([x + self.half_width, self.half_width - y]) * self.scale - 0.5
 
-    def centres(self) -> FloatArray:
-        """The plane's points at the pixel centres, shape ``(size, size, 2)``."""
+    def centers(self) -> FloatArray:
+        """The plane's points at the pixel centers, shape ``(size, size, 2)``."""
         along = (np.arange(len(self.image)) + 0.5) / self.scale - self.half_width
         return np.stack(np.meshgrid(along, -along), axis=-1)
 
@@ -51,7 +51,7 @@ class Canvas:
         start: ArrayLike,
         end: ArrayLike,
         width: float,
-        colour: Colour,
+        color: Color,
         opacity: float = 1.0,
     ) -> None:
         """Draw a line with round ends.
@@ -61,7 +61,7 @@ class Canvas:
         :param start: the segment's first point
         :param end: its last point; the same as ``start`` draws a disc
         :param width: in the plane's units
-        :param colour: red, green and blue in [0, 1]
+        :param color: red, green and blue in [0, 1]
         :param opacity: in [0, 1]
         """
         first, last = self.pixel(start), self.pixel(end)
@@ -72,11 +72,11 @@ class Canvas:
         rows, columns = np.ogrid[: window.shape[0], : window.shape[1]]
         distance = _distance_to_segment(columns + low[0], rows + low[1], first, last)
         cover = opacity * (reach - distance).clip(0, 1)[..., None]
-        window += cover * (np.array(colour) - window)
+        window += cover * (np.array(color) - window)
 
-    def disc(self, centre: ArrayLike, radius: float, colour: Colour, opacity: float = 1.0) -> None:
+    def disc(self, center: ArrayLike, radius: float, color: Color, opacity: float = 1.0) -> None:
         """Draw a filled circle; the arguments are those of ``line``."""
-        self.line(centre, centre, 2 * radius, colour, opacity)
+        self.line(center, center, 2 * radius, color, opacity)
 
     def to_uint8(self) -> NDArray[np.uint8]:
         """The picture as bytes, shape ``(size, size, 3)``."""
@@ -115,7 +115,7 @@ def draw_maze(
     """A square maze from above, its goals and the path of one episode.
 
     :param free: whether each cell is free, rows from the top, shape ``(n, n)``
-    :param goals: shape ``(n_goals, 2)``, the maze's cells having side 1 and its centre the origin
+    :param goals: shape ``(n_goals, 2)``, the maze's cells having side 1 and its center the origin
     :param trail: the positions so far, oldest first, shape ``(n_positions, 2)``
     :param size: width and height in pixels
     """
@@ -123,7 +123,7 @@ def draw_maze(
     cell = np.arange(size) * len(free) // size
     canvas.image[~free[np.ix_(cell, cell)]] = MARGIN
     for goal in goals:
-        canvas.disc(goal, 0.2, GOAL_COLOURS[4])
+        canvas.disc(goal, 0.2, GOAL_COLORS[4])
     _draw_trail(canvas, trail, width=0.06)
     return canvas.to_uint8()
 
@@ -137,8 +137,8 @@ def _draw_trail(canvas: Canvas, trail: FloatArray, width: float) -> None:
     canvas.disc(trail[-1], 1.9 * width, INK)
 
 
-def _faded(colour: Colour, strength: float) -> Colour:
-    red, green, blue = (1 - strength * (1 - part) for part in colour)
+def _faded(color: Color, strength: float) -> Color:
+    red, green, blue = (1 - strength * (1 - part) for part in color)
     return red, green, blue
 
 
@@ -146,13 +146,13 @@ def _faded(colour: Colour, strength: float) -> Colour:
 def _workspace(goals: tuple[tuple[float, float], ...], wall: float, size: int) -> FloatArray:
     """What all frames share: each goal's glow (as wide as its reward), the goals, the walls."""
     canvas = Canvas(size, half_width=wall * 1.06)
-    points = canvas.centres()
+    points = canvas.centers()
     squared = np.square(points[:, :, None] - np.array(goals)).sum(axis=-1)
-    colours = np.array([GOAL_COLOURS[i % len(GOAL_COLOURS)] for i in range(len(goals))])
-    glow = 0.30 * np.exp(-0.2 * squared)[..., None] * (1 - colours)
+    colors = np.array([GOAL_COLORS[i % len(GOAL_COLORS)] for i in range(len(goals))])
+    glow = 0.30 * np.exp(-0.2 * squared)[..., None] * (1 - colors)
     canvas.image = (1 - glow.sum(axis=2)).clip(0, 1)
     canvas.image[np.abs(points).max(axis=-1) > wall] = MARGIN
-    for goal, colour in zip(goals, colours.tolist(), strict=True):
+    for goal, color in zip(goals, colors.tolist(), strict=True):
         canvas.disc(goal, 0.42, (1.0, 1.0, 1.0))
-        canvas.disc(goal, 0.34, colour)
+        canvas.disc(goal, 0.34, color)
     return canvas.image

@@ -6,10 +6,10 @@ draws one of three goals for each episode and shows it to the agent, while the f
 and four goals with equal rewards. This module assumes:
 
 - The start is the stock map's, ``START_CELL``, without the stock task's noise: each episode begins
-  at rest at the centre of that cell.
+  at rest at the center of that cell.
 - Three goals are the stock map's. For the fourth, which the paper does not locate, the free cell is
   taken that is farthest from the start along the corridors among those at least two cells from
-  every other goal. All lie at the centres of their cells.
+  every other goal. All lie at the centers of their cells.
 - The reward is the stock one, ``exp(-distance)``, of the distance to the nearest goal.
 - Reaching a goal ends nothing; an episode is truncated after 600 steps, as in the stock task.
 - The observation is the stock one without its goals: ``[x, y, v_x, v_y]``.
@@ -24,8 +24,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_policyflow.envs import import_extra
 from sb3_policyflow.envs.drawing import draw_maze
+from sb3_policyflow.envs.extras import import_extra
 
 if TYPE_CHECKING:
     from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
@@ -44,7 +44,7 @@ FRAME_SIZE = 480
 def medium_maze() -> NDArray[np.bool_]:
     """Whether each cell of gymnasium-robotics' medium maze is free, rows from the top.
 
-    Cells are squares of side 1, and the maze is centred on the origin.
+    Cells are squares of side 1, and the maze is centered on the origin.
     """
     import_extra("gymnasium_robotics", "robotics", ENV_ID)
     from gymnasium_robotics.envs.maze.maps import MEDIUM_MAZE
@@ -53,8 +53,8 @@ def medium_maze() -> NDArray[np.bool_]:
     return free
 
 
-def cell_centre(cell: Cell, maze: NDArray[np.bool_]) -> FloatArray:
-    """Position of the centre of cell (row, column)."""
+def cell_center(cell: Cell, maze: NDArray[np.bool_]) -> FloatArray:
+    """Position of the center of cell (row, column)."""
     row, column = cell
     n_rows, n_columns = maze.shape
     return np.array([column + 0.5 - n_columns / 2, n_rows / 2 - row - 0.5])
@@ -83,8 +83,8 @@ class PointMazeMultiGoalEnv(gym.Env[FloatArray, NDArray[np.float32]]):
         self.maze = medium_maze()
         start_cell, *goal_cells = ((row, column) for row, column in (start_cell, *goal_cells))
         _require_free(self.maze, (start_cell, *goal_cells))
-        self.start = cell_centre(start_cell, self.maze)
-        self.goals: FloatArray = np.stack([cell_centre(cell, self.maze) for cell in goal_cells])
+        self.start = cell_center(start_cell, self.maze)
+        self.goals: FloatArray = np.stack([cell_center(cell, self.maze) for cell in goal_cells])
         self.simulation = _stock_environment(self.maze, start_cell, goal_cells)
         self.observation_space = self.simulation.observation_space["observation"]
         self.action_space = self.simulation.action_space

@@ -1,4 +1,4 @@
-"""Gymnasium vector environments as Stable-Baselines3 vectorised environments."""
+"""Gymnasium vector environments as Stable-Baselines3 vectorized environments."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Continuous normalizing flows for policies, in plain torch: fields, paths, solvers and times."""
 
-from sb3_policyflow.flows.paths import (
+from sb3_policyflow.flows.interpolants import (
     PATHS,
     ExactStochasticInterpolant,
     Path,
@@ -16,10 +16,10 @@ from sb3_policyflow.flows.times import (
     TimeSampler,
     UniformTimes,
 )
-from sb3_policyflow.flows.velocity import INITIALISATIONS, FourierTimeEmbedding, VelocityField
+from sb3_policyflow.flows.velocity import INITIALIZATIONS, FourierTimeEmbedding, VelocityField
 
 __all__ = [
-    "INITIALISATIONS",
+    "INITIALIZATIONS",
     "PATHS",
     "SOLVERS",
     "TIME_SAMPLERS",

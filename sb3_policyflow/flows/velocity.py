@@ -81,9 +81,9 @@ class VelocityField(nn.Module):
     :param embedding_dim: Size of the time and observation embeddings.
     :param frequencies: See :class:`FourierTimeEmbedding`.
     :param frequency_scale: See :class:`FourierTimeEmbedding`.
-    :param initialisation: "glorot", "glorot_zero_output" or "zero" (paper, sensitivity to network
-        initialisation). With "zero" only the output's bias ever learns if the activation of 0 is 0.
-    :raises ValueError: If the initialisation is unknown or the embedding is empty.
+    :param initialization: "glorot", "glorot_zero_output" or "zero" (paper, sensitivity to network
+        initialization). With "zero" only the output's bias ever learns if the activation of 0 is 0.
+    :raises ValueError: If the initialization is unknown or the embedding is empty.
     """
 
     def __init__(
@@ -95,19 +95,19 @@ class VelocityField(nn.Module):
         embedding_dim: int = 64,
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
-        initialisation: str = "glorot_zero_output",
+        initialization: str = "glorot_zero_output",
     ) -> None:
         super().__init__()
         if embedding_dim < 1:
             raise ValueError(f"embedding_dim must be at least 1, got {embedding_dim}.")
-        initialise = choose("initialisation", initialisation, INITIALISATIONS)
+        initialize = choose("initialization", initialization, INITIALIZATIONS)
         self.time_embedding = FourierTimeEmbedding(
             embedding_dim, frequencies, frequency_scale, activation_fn
         )
         self.observation_embedding = nn.Linear(features_dim, embedding_dim)
         self.hidden = _hidden_layers(dim + embedding_dim, net_arch, activation_fn)
         self.output = nn.Linear([dim + embedding_dim, *net_arch][-1], dim)
-        initialise(self)
+        initialize(self)
 
     @property
     def layers(self) -> list[nn.Module]:
@@ -158,7 +158,7 @@ def _zero(field: VelocityField) -> None:
         nn.init.zeros_(parameter)
 
 
-INITIALISATIONS: dict[str, Callable[[VelocityField], None]] = {
+INITIALIZATIONS: dict[str, Callable[[VelocityField], None]] = {
     "glorot": _glorot,
     "glorot_zero_output": _glorot_zero_output,
     "zero": _zero,

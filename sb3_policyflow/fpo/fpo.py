@@ -57,8 +57,8 @@ class FPO(SampledEntropyMixin):
     :param loss_reduction: "mean" over action dimensions, or their "sum" (FPO++).
     :param time_sampler: Times of the probes: "starts" of Euler's steps, "grid" (the same with the
         end) or "uniform".
-    :param trust_region: "ppo" clips, "spo" penalises changes quadratically, and "aspo" (FPO++)
-        clips for positive advantages and penalises for negative ones.
+    :param trust_region: "ppo" clips, "spo" penalizes changes quadratically, and "aspo" (FPO++)
+        clips for positive advantages and penalizes for negative ones.
     :param loss_clamp: Greatest loss of a probe; None for none.
     :param difference_clamp: Greatest change of a probe's loss; None for none.
     :param n_flow_steps: Solver steps from noise to action.
@@ -198,7 +198,7 @@ class FPO(SampledEntropyMixin):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_times"]
 
-    def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Probes:
+    def _behavior(self, rollout: FlowRolloutBufferSamples) -> Probes:
         """Draw the probes and take their losses, with the weights that made the rollout.
 
         Drawn here and not when acting, they are the same in distribution, because weights do not
@@ -212,9 +212,9 @@ class FPO(SampledEntropyMixin):
         drawn = rollout._replace(probes=Probes(times, noises, unknown))
         return Probes(times, noises, in_chunks(self._old_losses, drawn))
 
-    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Probes) -> Probes:  # noqa: ARG002
+    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behavior: Probes) -> Probes:  # noqa: ARG002
         """The same probes in every epoch."""
-        return behaviour
+        return behavior
 
     def _old_losses(self, samples: FlowRolloutBufferSamples) -> th.Tensor:
         return self._losses(samples, self.policy.actor_features(samples.observations))
@@ -240,7 +240,7 @@ class FPO(SampledEntropyMixin):
         self,
         batch: FlowRolloutBufferSamples,
         features: th.Tensor,
-        behaviour: Probes,  # noqa: ARG002  # the probes of the minibatch came with it
+        behavior: Probes,  # noqa: ARG002  # the probes of the minibatch came with it
     ) -> PolicyTerms:
         """Ratio from the change of the flow-matching loss (FPO, equation of the ratio)."""
         losses = self._losses(batch, features)
@@ -249,11 +249,11 @@ class FPO(SampledEntropyMixin):
             log_ratio = log_ratio.clamp(-self.difference_clamp, self.difference_clamp)
         if self.probe_average == "loss":
             log_ratio = log_ratio.mean(dim=1)
-        regulariser, figures = self._entropy_bonus(features)
+        regularizer, figures = self._entropy_bonus(features)
         return PolicyTerms(
             log_ratio=log_ratio,
             kl=ratio_divergence(log_ratio),
-            regulariser=regulariser,
+            regularizer=regularizer,
             metrics={**figures, "flow_matching_loss": losses.mean()},
         )
 

@@ -20,7 +20,7 @@ from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
 from sb3_policyflow.flows import TIME_SAMPLERS
-from sb3_policyflow.policyflow.behaviour import Behaviour
+from sb3_policyflow.policyflow.behavior import Behavior
 from sb3_policyflow.policyflow.policies import (
     CnnFlowPolicy,
     FlowPolicy,
@@ -52,12 +52,12 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
 
     PPO's update with the importance ratio of the Gaussian noise around a flow's end point, which
     is taken to shift by the change of the velocity between latent and end point, and with an
-    entropy regulariser that lets the flow spread as Brownian motion would.
+    entropy regularizer that lets the flow spread as Brownian motion would.
 
     Takes the arguments of SB3's PPO with its names, order and defaults, those of
     :class:`~sb3_policyflow.common.arguments.FlowAlgorithmArguments`, and:
 
-    :param brownian_coef: w_b, weight of the Brownian regulariser: a constant, "lin_START",
+    :param brownian_coef: w_b, weight of the Brownian regularizer: a constant, "lin_START",
         "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
         entropy of the Gaussian noise and takes the same forms.
     :param path: Interpolation path: "rectified", "stochastic", "stochastic_exact" or "trigflow". In
@@ -73,7 +73,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     :param gaussian: Whether the latents are always 0, which leaves a Gaussian policy. With
         ``solver="euler"``, ``n_flow_steps=1`` and ``time_sampler="starts"`` it is PPO's, exactly.
     :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
-        regulariser (Ding et al., 2024). Takes the forms of ``brownian_coef``.
+        regularizer (Ding et al., 2024). Takes the forms of ``brownian_coef``.
     :param log_ratio_clamp: Greatest absolute log ratio that learns; beyond it there is no gradient
         and no overflow. None for none. ``train/log_ratio_max`` tells what it was before.
     :raises ValueError: If an argument cannot be used.
@@ -215,23 +215,23 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         derived = ["_brownian_schedule", "_uniform_schedule", "_uniform", "_times"]
         return [*super()._excluded_save_params(), *derived]
 
-    def _behaviour(self, rollout: FlowRolloutBufferSamples) -> Behaviour:
+    def _behavior(self, rollout: FlowRolloutBufferSamples) -> Behavior:
         """The policy before the update, theta-hat and sigma-hat."""
         features = in_chunks(self.policy.actor_features, rollout.observations)
-        return Behaviour(self.policy, features)
+        return Behavior(self.policy, features)
 
-    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behaviour: Behaviour) -> Probes:
+    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behavior: Behavior) -> Probes:
         """Draw t for each sample and look up the old velocity at x_t."""
         record: PolicyFlowRecord = rollout.record
         times = self._times.sample(len(rollout.actions), self.n_times)
         latents, endpoints = record.latents.unsqueeze(1), record.endpoints.unsqueeze(1)
         points = self.policy.path.interpolate(latents, endpoints, times)
-        return Probes(times, points, behaviour.velocity(points, times))
+        return Probes(times, points, behavior.velocity(points, times))
 
     def _policy_terms(
-        self, batch: FlowRolloutBufferSamples, features: th.Tensor, behaviour: Behaviour
+        self, batch: FlowRolloutBufferSamples, features: th.Tensor, behavior: Behavior
     ) -> PolicyTerms:
-        """Ratio and regularisers from the change of the velocity (paper, ratio and J^Reg)."""
+        """Ratio and regularizers from the change of the velocity (paper, ratio and J^Reg)."""
         probes: Probes = batch.probes
         velocity = self.policy.velocity(probes.points, probes.times, features.unsqueeze(1))
         change = velocity - probes.old_velocity
@@ -240,20 +240,20 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         if self.time_average == "shift":
             shift = shift.mean(dim=1, keepdim=True)
         noise = (batch.actions - batch.record.endpoints).unsqueeze(1)
-        log_std, old_log_std = self.policy.noise_log_std, behaviour.log_std
+        log_std, old_log_std = self.policy.noise_log_std, behavior.log_std
         log_ratio = shifted_gaussian_log_ratio(noise, shift, log_std, old_log_std)
-        regulariser, figures = self._regulariser(probes, velocity, features)
+        regularizer, figures = self._regularizer(probes, velocity, features)
         if self.log_ratio_clamp is not None:
             figures["log_ratio_max"] = log_ratio.detach().abs().max()
             log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
         return PolicyTerms(
             log_ratio=log_ratio,
             kl=gaussian_kl(shift.detach(), log_std.detach(), old_log_std).mean(),
-            regulariser=regulariser,
+            regularizer=regularizer,
             metrics={**figures, "velocity_change": change.detach().norm(dim=-1).mean()},
         )
 
-    def _regulariser(
+    def _regularizer(
         self, probes: Probes, velocity: th.Tensor, features: th.Tensor
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """What keeps the policy from becoming narrow, and its parts to log."""
@@ -264,13 +264,13 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
             probes, velocity if brownian_coef != 0 else velocity.detach()
         )
         entropy = gaussian_entropy(self.policy.noise_log_std)
-        regulariser = brownian_coef * brownian_loss - ent_coef * entropy
+        regularizer = brownian_coef * brownian_loss - ent_coef * entropy
         figures = {"brownian_loss": brownian_loss, "entropy_loss": -entropy}
         if self._uniform is not None:
             uniform_loss = self._uniform.loss(self.policy.velocity, features)
-            regulariser = regulariser + self._now(self._uniform_schedule) * uniform_loss
+            regularizer = regularizer + self._now(self._uniform_schedule) * uniform_loss
             figures["uniform_noise_loss"] = uniform_loss
-        return regulariser, figures
+        return regularizer, figures
 
     def _brownian_loss(self, probes: Probes, velocity: th.Tensor) -> th.Tensor:
         """Mean over samples of ||eta||^2 (paper, J^Reg)."""

@@ -1,4 +1,4 @@
-"""Flow matching towards uniform actions, as an entropy regulariser."""
+"""Flow matching towards uniform actions, as an entropy regularizer."""
 
 import torch as th
 from gymnasium import spaces
@@ -11,7 +11,7 @@ class UniformTargets:
 
     E ||v(x_t, t, s) - dx_t/dt||^2,    x_t between a latent z and u ~ U(actions),  t ~ U(0, T)
 
-    The diffusion entropy regularisation of Ding et al. (2024), "Diffusion-based Reinforcement
+    The diffusion entropy regularization of Ding et al. (2024), "Diffusion-based Reinforcement
     Learning via Q-weighted Variational Policy Optimization", https://arxiv.org/abs/2405.16173,
     with flow matching in place of its noise prediction; summed over action dimensions.
 

@@ -13,7 +13,7 @@ from sb3_policyflow.benchmark.goals import (
     evaluate_goals,
     goal_counts,
     goal_report,
-    normalised_entropy,
+    normalized_entropy,
     sample_trajectories,
 )
 from sb3_policyflow.benchmark.plots import (
@@ -22,13 +22,13 @@ from sb3_policyflow.benchmark.plots import (
     learning_curve_figure,
     read_learning_curve,
 )
-from sb3_policyflow.envs.drawing import GOAL_COLOURS
+from sb3_policyflow.envs.drawing import GOAL_COLORS
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
-from sb3_policyflow.envs.point_masses import GOALS
+from sb3_policyflow.envs.multigoal.point_masses import GOALS
 
 
 def straight_to(ends, n_steps=10):
-    """Straight lines from the centre, all of the same length in steps; NaN afterwards."""
+    """Straight lines from the center, all of the same length in steps; NaN afterwards."""
     positions = np.full((len(ends), 51, 2), np.nan)
     positions[:, : n_steps + 1] = np.linspace(0, ends, n_steps + 1, axis=1)
     n = len(ends)
@@ -84,13 +84,13 @@ def test_passing_a_goal_does_not_count():
     ],
 )
 def test_entropy_by_hand(counts, entropy):
-    assert normalised_entropy(counts) == pytest.approx(entropy)
+    assert normalized_entropy(counts) == pytest.approx(entropy)
 
 
 @pytest.mark.parametrize("counts", [[3], [1, -1], [[1, 2], [3, 4]], [np.nan, 1]])
 def test_entropy_refuses_what_is_not_counts(counts):
     with pytest.raises(ValueError, match="two or more counts"):
-        normalised_entropy(counts)
+        normalized_entropy(counts)
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, 2.5])
@@ -152,7 +152,7 @@ def test_a_deterministic_policy_has_one_trajectory():
     assert len(np.unique(single.ends().round(3), axis=0)) == 1
 
 
-def test_observations_are_normalised_as_in_training():
+def test_observations_are_normalized_as_in_training():
     env = VecNormalize(MultiGoalVecEnv(2, seed=0), norm_reward=False)
     env.reset()
     env.obs_rms.mean[:] = 3.0
@@ -173,8 +173,8 @@ def rendered(figure):
     return np.asarray(canvas.buffer_rgba())[..., :3] / 255
 
 
-def area_of(picture, colour):
-    return (np.abs(picture - np.array(colour)).max(axis=-1) < 0.02).sum()
+def area_of(picture, color):
+    return (np.abs(picture - np.array(color)).max(axis=-1) < 0.02).sum()
 
 
 def test_goals_figure_has_a_panel_for_each_run():
@@ -186,10 +186,10 @@ def test_goals_figure_has_a_panel_for_each_run():
     assert labels == ["entropy 1.00   return 2.5   no goal 0.0%"] * 4
 
 
-def test_goals_figure_gives_trajectories_the_colour_of_their_goal():
+def test_goals_figure_gives_trajectories_the_color_of_their_goal():
     nothing = rendered(goals_figure({"": straight_to([(0.0, 0.0)])}))
     one = rendered(goals_figure({"": straight_to([GOALS[2]])}))
-    grown = [area_of(one, colour) - area_of(nothing, colour) for colour in GOAL_COLOURS]
+    grown = [area_of(one, color) - area_of(nothing, color) for color in GOAL_COLORS]
     assert np.argmax(grown) == 2
     assert grown[2] > 1000, "a bar of one"
     assert max(abs(change) for i, change in enumerate(grown) if i != 2) < 100

@@ -66,10 +66,10 @@ def counted(model, total_timesteps):
     return counter.visits()
 
 
-@pytest.mark.parametrize("normalised", [False, True])
-def test_counts_where_each_step_of_a_training_ended(normalised):
+@pytest.mark.parametrize("normalized", [False, True])
+def test_counts_where_each_step_of_a_training_ended(normalized):
     env = make_vec_env(ENV_ID, n_envs=2, seed=0, wrapper_class=Recorder)
-    model = model_on(VecNormalize(env) if normalised else env)
+    model = model_on(VecNormalize(env) if normalized else env)
     visits = counted(model, 512)
     steps = np.concatenate(env.get_attr("positions"))
     assert visits.counts.sum() == len(steps) == 512

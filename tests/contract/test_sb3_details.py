@@ -42,7 +42,7 @@ def weights(model: Any) -> th.Tensor:
     )
 
 
-# Images, stacks and normalised parts
+# Images, stacks and normalized parts
 
 
 def test_vec_framestack_of_images(model_class: type[Any], tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_a2c_ppo_collect_rollouts_with_batch_norm(model_class: type[Any]) -> Non
     for _ in range(3):
         model.collect_rollouts(model.env, callback, model.rollout_buffer, 16)
     assert all(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
-    model._behaviour(model._rollout())
+    model._behavior(model._rollout())
     assert all(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
 
 

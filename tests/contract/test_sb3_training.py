@@ -1,4 +1,4 @@
-"""SB3's contract for callbacks, logs and normalisation; the tests have the names of SB3's own."""
+"""SB3's contract for callbacks, logs and normalization; the tests have the names of SB3's own."""
 
 import json
 import warnings
@@ -29,8 +29,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, sync_envs_normalization
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
 from sb3_policyflow.envs.vector import GymVectorVecEnv
+from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 
 SMALL: dict[str, Any] = {
     "n_steps": 32,
@@ -141,7 +141,7 @@ def test_eval_success_logging(model_class: type[Any], tmp_path: Path) -> None:
 
 
 def test_eval_friendly_error(model_class: type[Any]) -> None:
-    """Normalised training is not evaluated without normalisation."""
+    """Normalized training is not evaluated without normalization."""
     train = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
     plain = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
     model = make(model_class, train)
@@ -238,14 +238,14 @@ def test_tensorboard_folders_are_numbered(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["PolicyFlow_1", "PolicyFlow_2"]
 
 
-# Normalisation
+# Normalization
 
 
 def test_vec_normalize_and_sync(model_class: type[Any]) -> None:
-    def normalised() -> VecNormalize:
+    def normalized() -> VecNormalize:
         return VecNormalize(make_vec_env("Pendulum-v1", 2), clip_obs=5.0)
 
-    env, evaluation = normalised(), normalised()
+    env, evaluation = normalized(), normalized()
     evaluation.training, evaluation.norm_reward = False, False
     model = make(model_class, env).learn(128)
     sync_envs_normalization(env, evaluation)
@@ -284,7 +284,7 @@ def test_ppo(model_class: type[Any], clip_range_vf: float | str | None) -> None:
 def test_ppo_warnings(model_class: type[Any]) -> None:
     with pytest.warns(UserWarning, match="the last minibatch of each epoch will have"):
         make(model_class, n_steps=63)
-    with pytest.raises(ValueError, match="Advantages cannot be normalised over one sample"):
+    with pytest.raises(ValueError, match="Advantages cannot be normalized over one sample"):
         make(model_class, n_steps=1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

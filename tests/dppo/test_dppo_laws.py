@@ -26,7 +26,7 @@ def collected(**options: Any) -> tuple[DPPO, FlowRolloutBufferSamples]:
         batch_size=16,
         n_epochs=1,
         seed=0,
-        policy_kwargs={"initialisation": "glorot"},
+        policy_kwargs={"initialization": "glorot"},
         **options,
     )
     model.learn(N_SAMPLES)
@@ -176,7 +176,7 @@ def test_only_the_critic_warms_up() -> None:
 
 def image_model(**options: Any) -> DPPO:
     env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
-    policy_kwargs = {"initialisation": "glorot", **options.pop("policy_kwargs", {})}
+    policy_kwargs = {"initialization": "glorot", **options.pop("policy_kwargs", {})}
     sizes = {"n_steps": 32, "batch_size": 16, "n_epochs": 4, "learning_rate": 1e-3}
     return DPPO("CnnPolicy", env, policy_kwargs=policy_kwargs, seed=0, **sizes, **options)
 

@@ -14,9 +14,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecVideoRecorder
 
 import sb3_policyflow
-from sb3_policyflow.envs.drawing import GOAL_COLOURS, Canvas
+from sb3_policyflow.envs.drawing import GOAL_COLORS, Canvas
 from sb3_policyflow.envs.multigoal import MultiGoalEnv, MultiGoalVecEnv, MultiGoalVectorEnv
-from sb3_policyflow.envs.point_masses import FRAME_SIZE, GOALS, WALL, nearest_goal
+from sb3_policyflow.envs.multigoal.point_masses import FRAME_SIZE, GOALS, WALL, nearest_goal
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 STILL = np.zeros(2, dtype=np.float32)
@@ -329,8 +329,8 @@ def test_picture_shows_the_goals_the_walls_and_the_point():
         column, row = Canvas(FRAME_SIZE, WALL * 1.06).pixel(point).round().astype(int)
         return frame[row, column] / 255
 
-    for goal, colour in zip(GOALS, GOAL_COLOURS, strict=True):
-        np.testing.assert_allclose(at(goal), colour, atol=0.01)
+    for goal, color in zip(GOALS, GOAL_COLORS, strict=True):
+        np.testing.assert_allclose(at(goal), color, atol=0.01)
     assert at((0.0, 5.0)).max() < 0.3, "the point, after five steps of length one"
     assert at((0.0, 2.5)).max() < at((2.5, 0.0)).min(), "its trail"
     assert at((-3.0, -0.0)).min() > 0.9

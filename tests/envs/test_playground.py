@@ -26,7 +26,7 @@ from mujoco_playground import dm_control_suite, registry
 from mujoco_playground._src.dm_control_suite import cartpole
 from mujoco_playground._src.mjx_env import MENAGERIE_PATH
 
-from sb3_policyflow.envs.playground_batch import all_tasks, task_config
+from sb3_policyflow.envs.playground.batch import all_tasks, task_config
 
 STOCK_TASKS = all_tasks()
 """Before tests add more."""
@@ -206,7 +206,7 @@ def test_a_step_is_traced_once(monkeypatch):
     assert len(traced) == n_traced
 
 
-def test_policyflow_learns_with_normalisation(cartpoles):
+def test_policyflow_learns_with_normalization(cartpoles):
     env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
     model = sb3_policyflow.PolicyFlow("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2)
     before = [parameter.clone() for parameter in model.policy.parameters()]

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow.envs import ensure_registered
-from sb3_policyflow.envs.drawing import GOAL_COLOURS, Canvas
+from sb3_policyflow.envs.drawing import GOAL_COLORS, Canvas
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 pytest.importorskip("gymnasium_robotics")
@@ -26,7 +26,7 @@ from sb3_policyflow.envs.point_maze import (
     GOAL_CELLS,
     START_CELL,
     PointMazeMultiGoalEnv,
-    cell_centre,
+    cell_center,
     medium_maze,
 )
 
@@ -80,9 +80,9 @@ def test_every_episode_starts_at_rest_at_one_point():
 def test_start_and_three_goals_are_the_stock_maps():
     maze, theirs = medium_maze(), stock().maze
     np.testing.assert_array_equal(
-        cell_centre(START_CELL, maze), theirs.unique_reset_locations[0], strict=True
+        cell_center(START_CELL, maze), theirs.unique_reset_locations[0], strict=True
     )
-    ours = {tuple(cell_centre(cell, maze)) for cell in GOAL_CELLS}
+    ours = {tuple(cell_center(cell, maze)) for cell in GOAL_CELLS}
     assert {tuple(goal) for goal in theirs.unique_goal_locations} < ours
     assert len(ours) == 4
 
@@ -162,7 +162,7 @@ def test_picture_shows_walls_goals_and_ball():
         return frame[row, column] / 255
 
     for goal in env.goals:
-        np.testing.assert_allclose(at(goal), GOAL_COLOURS[4], atol=0.01)
+        np.testing.assert_allclose(at(goal), GOAL_COLORS[4], atol=0.01)
     assert at(env.start).max() < 0.3
     assert at((-1.5, 1.5)).min() == 1.0, "a free cell"
     assert at((-0.5, 2.5)).max() < 0.95, "a wall"

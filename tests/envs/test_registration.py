@@ -16,7 +16,7 @@ def run(code, **options):
 def test_ids_are_known_without_the_simulator():
     done = run(
         "import sys, gymnasium as gym, sb3_policyflow\n"
-        "from sb3_policyflow.envs.playground_names import *\n"
+        "from sb3_policyflow.envs.task_names import *\n"
         "for task in PLAYGROUND_TASKS + OTHER_PLAYGROUND_TASKS:\n"
         "    assert gym.spec(f'Playground/{task}-v0').vector_entry_point is not None\n"
         "import sb3_policyflow.envs.playground\n"

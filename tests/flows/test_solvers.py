@@ -79,7 +79,7 @@ def test_two_midpoint_steps_by_hand() -> None:
 
 
 def test_flow_of_a_network_against_dopri5() -> None:
-    field = VelocityField(2, 3, net_arch=[16, 16], initialisation="glorot").double()
+    field = VelocityField(2, 3, net_arch=[16, 16], initialization="glorot").double()
     features = th.randn(2, 3, dtype=th.float64)
 
     def velocity(x: th.Tensor, t: th.Tensor) -> th.Tensor:

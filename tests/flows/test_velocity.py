@@ -24,7 +24,7 @@ def test_frequencies_are_fixed_but_saved() -> None:
 
 
 def test_field_is_the_formula_of_the_paper() -> None:
-    field = VelocityField(2, 3, net_arch=[5], activation_fn=nn.SiLU, initialisation="glorot")
+    field = VelocityField(2, 3, net_arch=[5], activation_fn=nn.SiLU, initialization="glorot")
     x, t, s = th.randn(7, 2), th.rand(7), th.randn(7, 3)
     embedding = field.time_embedding(t) + field.observation_embedding(s)
     first, last = field.hidden[0], field.output
@@ -34,7 +34,7 @@ def test_field_is_the_formula_of_the_paper() -> None:
 
 
 def test_leading_shapes_broadcast() -> None:
-    field = VelocityField(2, 3, initialisation="glorot")
+    field = VelocityField(2, 3, initialization="glorot")
     x, t, s = th.randn(6, 4, 2), th.rand(6, 4), th.randn(6, 1, 3)
     together = field(x, t, s)
     one_by_one = th.stack([field(x[:, k], t[:, k], s[:, 0]) for k in range(4)], dim=1)
@@ -44,25 +44,25 @@ def test_leading_shapes_broadcast() -> None:
     )
 
 
-def test_initialisations() -> None:
+def test_initializations() -> None:
     x, t, s = th.randn(7, 2), th.rand(7), th.randn(7, 3)
     fields = {
-        name: VelocityField(2, 3, initialisation=name)
+        name: VelocityField(2, 3, initialization=name)
         for name in ("glorot", "glorot_zero_output", "zero")
     }
     assert fields["glorot"](x, t, s).abs().min() > 0
     assert th.equal(fields["glorot_zero_output"](x, t, s), th.zeros(7, 2))
     assert fields["glorot_zero_output"].hidden[0].weight.abs().sum() > 0  # type: ignore[operator, union-attr]
     assert all(not parameter.any() for parameter in fields["zero"].parameters())
-    wide = VelocityField(200, 3, net_arch=[300], initialisation="glorot", embedding_dim=100)
+    wide = VelocityField(200, 3, net_arch=[300], initialization="glorot", embedding_dim=100)
     weight = wide.hidden[0].weight
     assert isinstance(weight, th.Tensor)
     assert weight.std().item() == pytest.approx(math.sqrt(2 / (300 + 300)), rel=0.05)
 
 
-def test_unknown_initialisation_is_refused_with_the_choices() -> None:
+def test_unknown_initialization_is_refused_with_the_choices() -> None:
     with pytest.raises(ValueError, match=r"'ones'.*'glorot', 'glorot_zero_output', 'zero'"):
-        VelocityField(2, 3, initialisation="ones")
+        VelocityField(2, 3, initialization="ones")
 
 
 def test_empty_embedding_is_refused() -> None:

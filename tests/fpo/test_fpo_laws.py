@@ -21,13 +21,13 @@ def collected(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
         batch_size=16,
         n_epochs=1,
         seed=0,
-        policy_kwargs={"initialisation": "glorot"},
+        policy_kwargs={"initialization": "glorot"},
         **options,
     )
     model.learn(64)
     model.policy.set_training_mode(False)
     rollout = model._rollout()
-    probes = model._draw_probes(rollout, model._behaviour(rollout))
+    probes = model._draw_probes(rollout, model._behavior(rollout))
     return model, rollout._replace(probes=probes)
 
 

@@ -40,11 +40,11 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
         actions, record = policy.sample_actions(features)
         old = gaussian()
         rollout = rollout._replace(actions=actions, record=record)
-        behaviour = model._behaviour(rollout)
-        probes = model._draw_probes(rollout, behaviour)
+        behavior = model._behavior(rollout)
+        probes = model._draw_probes(rollout, behavior)
         for parameter in policy.parameters():
             parameter += 0.05 * th.randn_like(parameter)
-        terms = model._policy_terms(rollout._replace(probes=probes), features, behaviour)
+        terms = model._policy_terms(rollout._replace(probes=probes), features, behavior)
         new = gaussian()
     assert th.equal(record.latents, zeros)
     th.testing.assert_close(record.endpoints, old.mean)
@@ -52,7 +52,7 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
     th.testing.assert_close(terms.log_ratio[:, 0], expected, atol=1e-5, rtol=1e-4)
     divergence = th.distributions.kl_divergence(old, new).mean()
     th.testing.assert_close(terms.kl, divergence, atol=1e-6, rtol=1e-4)
-    assert terms.regulariser.item() == pytest.approx(-0.01 * new.entropy().mean().item())
+    assert terms.regularizer.item() == pytest.approx(-0.01 * new.entropy().mean().item())
 
 
 def test_gaussian_mode_has_no_flow_to_spread() -> None:

@@ -92,7 +92,7 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"n_steps": 0}, r"n_steps must be at least 1"),
         ({"n_epochs": 0}, r"n_epochs must be at least 1"),
         ({"clip_range_vf": -0.2}, r"clip_range_vf must be positive, or None"),
-        ({"policy_kwargs": {"initialisation": "he"}}, r"Unknown initialisation 'he'"),
+        ({"policy_kwargs": {"initialization": "he"}}, r"Unknown initialization 'he'"),
         ({"policy_kwargs": {"embedding_dim": 0}}, r"embedding_dim must be at least 1"),
         ({"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to PolicyFlow itself"),
     ],

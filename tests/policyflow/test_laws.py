@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 import torch as th
+from sb3_policyflow.policyflow.behavior import Behavior
 from torch import nn
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.losses import clipped_surrogate
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
-from sb3_policyflow.policyflow.behaviour import Behaviour
 from sb3_policyflow.policyflow.policies import PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import Probes
 
@@ -22,7 +22,7 @@ def tiny_model(**options: Any) -> PolicyFlow:
     policy_kwargs = {
         "net_arch": {"pi": [4], "vf": [4]},
         "embedding_dim": 4,
-        "initialisation": "glorot",
+        "initialization": "glorot",
         "activation_fn": nn.SiLU,
         **options.pop("policy_kwargs", {}),
     }
@@ -40,8 +40,8 @@ def tiny_model(**options: Any) -> PolicyFlow:
     return model
 
 
-def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor, Behaviour]:
-    """A batch sampled from the model's policy, its features and the behaviour."""
+def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor, Behavior]:
+    """A batch sampled from the model's policy, its features and the behavior."""
     features = th.randn(N_SAMPLES, 3, dtype=th.float64)
     with th.no_grad():
         actions, record = model.policy.sample_actions(features)
@@ -53,8 +53,8 @@ def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor
         returns=th.randn(N_SAMPLES, dtype=th.float64),
         record=record,
     )
-    behaviour = Behaviour(model.policy, features)
-    return batch._replace(probes=model._draw_probes(batch, behaviour)), features, behaviour
+    behavior = Behavior(model.policy, features)
+    return batch._replace(probes=model._draw_probes(batch, behavior)), features, behavior
 
 
 def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
@@ -67,8 +67,8 @@ def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
 @pytest.mark.parametrize("n_times", [1, 3])
 def test_nothing_has_changed_before_the_first_step(path: str, n_times: int) -> None:
     model = tiny_model(path=path, n_times=n_times)
-    batch, features, behaviour = sample_batch(model)
-    terms = model._policy_terms(batch, features, behaviour)
+    batch, features, behavior = sample_batch(model)
+    terms = model._policy_terms(batch, features, behavior)
     assert th.equal(terms.log_ratio, th.zeros(N_SAMPLES, n_times, dtype=th.float64))
     assert terms.kl.item() == 0.0
     assert terms.metrics["velocity_change"].item() == 0.0
@@ -76,16 +76,16 @@ def test_nothing_has_changed_before_the_first_step(path: str, n_times: int) -> N
 
 def test_ratio_is_that_of_the_shifted_gaussian() -> None:
     model = tiny_model()
-    batch, features, behaviour = sample_batch(model)
+    batch, features, behavior = sample_batch(model)
     perturb(model)
-    terms = model._policy_terms(batch, features, behaviour)
+    terms = model._policy_terms(batch, features, behavior)
     probes: Probes = batch.probes
     with th.no_grad():
         new_velocity = model.policy.velocity(probes.points[:, 0], probes.times[:, 0], features)
         change = new_velocity - probes.old_velocity[:, 0]
         noise = batch.actions - batch.record.endpoints
         new = Independent(Normal(change, model.policy.log_std.exp()), 1).log_prob(noise)
-        old = Independent(Normal(th.zeros_like(noise), behaviour.log_std.exp()), 1).log_prob(noise)
+        old = Independent(Normal(th.zeros_like(noise), behavior.log_std.exp()), 1).log_prob(noise)
     th.testing.assert_close(terms.log_ratio[:, 0], new - old)
     assert terms.log_ratio.abs().min() > 0
 
@@ -93,16 +93,16 @@ def test_ratio_is_that_of_the_shifted_gaussian() -> None:
 def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
     """A velocity that grows by a constant moves the end point by (pi/2) times it, exactly."""
     model = tiny_model(path="trigflow", time_average="shift", n_times=2, n_flow_steps=5)
-    batch, features, behaviour = sample_batch(model)
+    batch, features, behavior = sample_batch(model)
     change = th.tensor([0.01], dtype=th.float64)
     with th.no_grad():
         model.policy.velocity.output.weight.zero_()
         before = model.policy.carry(batch.record.latents, features)
-        behaviour = Behaviour(model.policy, features)
-        probes = model._draw_probes(batch, behaviour)
+        behavior = Behavior(model.policy, features)
+        probes = model._draw_probes(batch, behavior)
         model.policy.velocity.output.bias += change
         true_shift = model.policy.carry(batch.record.latents, features) - before
-    terms = model._policy_terms(batch._replace(probes=probes), features, behaviour)
+    terms = model._policy_terms(batch._replace(probes=probes), features, behavior)
     noise = batch.actions - batch.record.endpoints
     log_std = model.policy.log_std
     new = Independent(Normal(true_shift, log_std.exp()), 1).log_prob(noise)
@@ -112,16 +112,16 @@ def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
 
 def test_equals_gaussian_ppo_when_the_old_velocity_and_the_latents_are_zero() -> None:
     """With z = phi = 0 and v_old = 0 the new velocity is the mean of PPO's Gaussian."""
-    model = tiny_model(policy_kwargs={"initialisation": "glorot_zero_output"}, ent_coef=0.01)
-    batch, features, behaviour = sample_batch(model)
+    model = tiny_model(policy_kwargs={"initialization": "glorot_zero_output"}, ent_coef=0.01)
+    batch, features, behavior = sample_batch(model)
     zeros = th.zeros_like(batch.actions)
     batch = batch._replace(record=PolicyFlowRecord(zeros, zeros), actions=th.randn_like(zeros))
-    batch = batch._replace(probes=model._draw_probes(batch, behaviour))
+    batch = batch._replace(probes=model._draw_probes(batch, behavior))
     perturb(model)
     advantages, parameters = batch.advantages, actor_parameters(model)
 
-    terms = model._policy_terms(batch, features, behaviour)
-    ours = -clipped_surrogate(terms.log_ratio[:, 0], advantages, 0.2).mean() + terms.regulariser
+    terms = model._policy_terms(batch, features, behavior)
+    ours = -clipped_surrogate(terms.log_ratio[:, 0], advantages, 0.2).mean() + terms.regularizer
 
     means = model.policy.velocity(zeros, batch.probes.times[:, 0], features)
     gaussian = Independent(Normal(means, model.policy.log_std.exp()), 1)
@@ -144,13 +144,13 @@ def actor_parameters(model: PolicyFlow) -> list[nn.Parameter]:
 @pytest.mark.parametrize("path", ["rectified", "stochastic", "trigflow"])
 def test_gradient_equals_finite_differences_for_every_parameter(path: str) -> None:
     model = tiny_model(path=path, brownian_coef=0.25, ent_coef=0.01, n_times=2)
-    batch, features, behaviour = sample_batch(model)
+    batch, features, behavior = sample_batch(model)
     perturb(model, 0.02)
 
     def loss() -> th.Tensor:
-        terms = model._policy_terms(batch, features, behaviour)
+        terms = model._policy_terms(batch, features, behavior)
         objective = clipped_surrogate(terms.log_ratio, batch.advantages.unsqueeze(1), 0.2)
-        return -objective.mean() + terms.regulariser
+        return -objective.mean() + terms.regularizer
 
     parameters = actor_parameters(model)
     gradients = th.autograd.grad(loss(), parameters)
@@ -163,12 +163,12 @@ def finite_differences(loss: Any, parameter: th.Tensor, step: float = 1e-6) -> t
     slopes = th.zeros_like(parameter)
     flat, flat_slopes = parameter.detach().view(-1), slopes.view(-1)
     for index in range(len(flat)):
-        centre = flat[index].item()
+        center = flat[index].item()
         values = []
         for sign in (1, -1):
-            flat[index] = centre + sign * step
+            flat[index] = center + sign * step
             values.append(loss().item())
-        flat[index] = centre
+        flat[index] = center
         flat_slopes[index] = (values[0] - values[1]) / (2 * step)
     return slopes
 

@@ -316,7 +316,7 @@ def test_gradient_clipping_can_be_turned_off(off: float | None) -> None:
 
 
 @pytest.mark.parametrize("scope", ["minibatch", "rollout"])
-def test_advantages_are_normalised_where_asked(scope: str) -> None:
+def test_advantages_are_normalized_where_asked(scope: str) -> None:
     model = PolicyFlow("MlpPolicy", "Pendulum-v1", advantage_scope=scope, **SMALL).learn(64)
     rollout = model._rollout()
     batch = next(model.rollout_buffer.minibatches(rollout, 32))

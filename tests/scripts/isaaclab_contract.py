@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "envs" / "fake_isaaclab" / "common"))
+sys.path.insert(
+    0, str(Path(__file__).parents[1] / "integrations" / "isaaclab" / "fake_isaaclab" / "common")
+)
 import fake_lab
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.envs.isaaclab import presets
+from sb3_policyflow.integrations.isaaclab import presets
 
 N_ENVS, N_STEPS = 32, 200
 

@@ -17,9 +17,9 @@ import torch as th
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
-from sb3_policyflow.common.saving import RandomStates
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
+from sb3_policyflow.resilience.saving import RandomStates
 
 ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -34,7 +34,7 @@ HALF = TOTAL // 2
 
 
 def digest(model: Any) -> str:
-    """A hash of parameters, optimiser, learning rate, statistics and random states."""
+    """A hash of parameters, optimizer, learning rate, statistics and random states."""
     normalize = model.get_vec_normalize_env()
     optimizer = model.policy.optimizer.state_dict()
     parts = [

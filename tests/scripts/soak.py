@@ -21,9 +21,9 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.common.callbacks import RolloutCheckpointCallback
-from sb3_policyflow.diagnostics import FlowDiagnosticsCallback
+from sb3_policyflow.callbacks import FlowDiagnosticsCallback
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 
 N_ENVS, N_STEPS = 256, 24
 TOTAL_TIMESTEPS = 50_000_000

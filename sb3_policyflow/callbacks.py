@@ -1,0 +1,201 @@
+"""How good the update's approximations are, measured on a sample of each rollout."""
+
+from copy import deepcopy
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_policyflow.common.checks import check_count
+from sb3_policyflow.common.entropy import action_entropy
+from sb3_policyflow.common.losses import gaussian_kl, shifted_gaussian_log_ratio
+from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows
+from sb3_policyflow.flows import TIME_SAMPLERS
+from sb3_policyflow.policyflow import FlowPolicy, PolicyFlow
+from sb3_policyflow.resilience.saving import random_states_kept
+
+
+class Shifts(NamedTuple):
+    """How far the end points of n latents have moved, each of shape (n, action_dim).
+
+    ``exact`` integrates the flow anew. ``approximate`` is the paper's: the change of the velocity
+    on the path between latent and old end point, averaged over the solver's times. ``sampled`` is
+    the same at the times that the algorithm draws, as its loss sees it.
+    """
+
+    exact: th.Tensor
+    approximate: th.Tensor
+    sampled: th.Tensor
+
+
+class FlowDiagnosticsCallback(BaseCallback):
+    """Compares the paper's importance ratio with the true one, on some samples of the rollout.
+
+    The flow is integrated with the parameters before and after the update. Given its latent, an
+    action has the exact log ratio log N(a; phi', sigma'^2) - log N(a; phi, sigma^2), which the
+    paper approximates by taking phi' - phi from the change of the velocity. Logged with the next
+    rollout, or at the end of the training, under ``diagnostics/``:
+
+    - ``log_ratio_correlation``, ``log_ratio_error``: between the approximate and the exact log
+      ratio, Pearson's coefficient and the root mean squared difference; and the same with
+      ``_sampled`` at the end, for the times that the algorithm draws.
+    - ``log_ratio_exact_std``: the size of the exact log ratio, to compare the error with.
+    - ``shift_exact``, ``shift_approximate``: mean lengths of the end point's shift; ``shift_error``
+      the mean length of their difference; ``shift_cosine`` the cosine between them.
+    - ``kl_exact``: the divergence of the policies given the latent, in nats, from the exact shift.
+    - ``action_entropy``: entropy of the actions in nats, from nearest neighbors, averaged over
+      states.
+
+    Training itself is the same with the callback and without it. For algorithms other than
+    PolicyFlow, only the entropy is logged.
+
+    :param every: Rollouts from one measurement to the next.
+    :param n_samples: Transitions of the rollout that are looked at. The cost is two integrations of
+        so many flows.
+    :param n_entropy_states: States in which the entropy of actions is estimated; 0 for none.
+    :param n_entropy_actions: Actions drawn in each of them, at least 2.
+    :param verbose: See SB3.
+    :raises ValueError: If a number is too small.
+    """
+
+    def __init__(
+        self,
+        every: int = 1,
+        n_samples: int = 1024,
+        n_entropy_states: int = 16,
+        n_entropy_actions: int = 64,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        check_count("every", every, 1)
+        check_count("n_samples", n_samples, 2)
+        check_count("n_entropy_states", n_entropy_states, 0)
+        check_count("n_entropy_actions", n_entropy_actions, 2)
+        self.every = every
+        self.n_samples = n_samples
+        self.n_entropy_states = n_entropy_states
+        self.n_entropy_actions = n_entropy_actions
+        self.n_rollouts = 0
+        self._before: tuple[FlowActorCriticPolicy, FlowRolloutBufferSamples] | None = None
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, FlowOnPolicyAlgorithm):
+            raise ValueError(
+                "FlowDiagnosticsCallback looks at flow policies, such as PolicyFlow's, not at "
+                f"{type(self.model).__name__}: leave it out."
+            )
+        self.algorithm = self.model
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        """Keep the policy and some of the rollout, before the update changes the policy."""
+        self.n_rollouts += 1
+        if self.n_rollouts % self.every == 0:
+            with random_states_kept(self.model.device), th.no_grad():
+                self._before = deepcopy(self.algorithm.policy), self._sample()
+
+    def _sample(self) -> FlowRolloutBufferSamples:
+        samples = self.algorithm.rollout_buffer.samples()
+        chosen = th.randperm(len(samples.actions))[: self.n_samples]
+        return rows(samples, chosen.to(samples.actions.device))
+
+    def _on_rollout_start(self) -> None:
+        if self._before is not None:
+            self._measure()
+
+    def _on_training_end(self) -> None:
+        if self._before is not None:
+            self._measure()
+            # SB3 writes the log after a rollout, and there is none to come.
+            self.logger.record("time/total_timesteps", self.num_timesteps)
+            self.logger.dump(self.num_timesteps)
+
+    def _measure(self) -> None:
+        """Compare the policy with what it was before the update."""
+        assert self._before is not None
+        (old, samples), self._before = self._before, None
+        new = self.algorithm.policy
+        new.set_training_mode(False)
+        with random_states_kept(self.model.device), th.no_grad():
+            figures = {}
+            if isinstance(old, FlowPolicy) and isinstance(new, FlowPolicy):
+                figures = self._compare(old, new, samples)
+            if self.n_entropy_states > 0:
+                figures["action_entropy"] = self._entropy(new, samples.observations)
+        for name, value in figures.items():
+            self.logger.record(f"diagnostics/{name}", value.item())
+
+    def _compare(
+        self, old: FlowPolicy, new: FlowPolicy, samples: FlowRolloutBufferSamples
+    ) -> dict[str, th.Tensor]:
+        shifts = end_point_shifts(old, new, samples, self._draw_times(samples))
+        noise = samples.actions - samples.record.endpoints
+        log_stds = new.noise_log_std, old.noise_log_std
+        exact, approximate, sampled = (
+            shifted_gaussian_log_ratio(noise, shift, *log_stds) for shift in shifts
+        )
+        return {
+            "log_ratio_correlation": _correlation(approximate, exact),
+            "log_ratio_error": _rms(approximate - exact),
+            "log_ratio_correlation_sampled": _correlation(sampled, exact),
+            "log_ratio_error_sampled": _rms(sampled - exact),
+            "log_ratio_exact_std": exact.std(),
+            "shift_exact": shifts.exact.norm(dim=-1).mean(),
+            "shift_approximate": shifts.approximate.norm(dim=-1).mean(),
+            "shift_error": (shifts.approximate - shifts.exact).norm(dim=-1).mean(),
+            "shift_cosine": th.cosine_similarity(shifts.approximate, shifts.exact).mean(),
+            "kl_exact": gaussian_kl(shifts.exact, *log_stds).mean(),
+        }
+
+    def _draw_times(self, samples: FlowRolloutBufferSamples) -> th.Tensor:
+        """Times as the algorithm draws them, shape (n, n_times)."""
+        model = self.algorithm
+        assert isinstance(model, PolicyFlow)
+        times = TIME_SAMPLERS[model.time_sampler](model.policy.solver_times())
+        return times.sample(len(samples.actions), model.n_times)
+
+    def _entropy(self, policy: FlowActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
+        """Entropy of the actions in nats, mean over states."""
+        some = rows(observations, slice(self.n_entropy_states))
+        return action_entropy(policy, policy.actor_features(some), self.n_entropy_actions)
+
+
+def end_point_shifts(
+    old: FlowPolicy, new: FlowPolicy, samples: FlowRolloutBufferSamples, times: th.Tensor
+) -> Shifts:
+    """How far the ends of the flow have moved between two policies.
+
+    :param old: The policy that made the samples.
+    :param new: The policy after an update.
+    :param samples: n transitions with the record of PolicyFlow.
+    :param times: Times for ``Shifts.sampled``, shape (n, k).
+    """
+    latents = samples.record.latents
+    features = {policy: policy.actor_features(samples.observations) for policy in (old, new)}
+    exact = new.carry(latents, features[new]) - old.carry(latents, features[old])
+    grid = old.solver_times().expand(len(latents), -1)
+
+    def mean_change(at: th.Tensor) -> th.Tensor:
+        ends = samples.record.endpoints.unsqueeze(1)
+        points = old.path.interpolate(latents.unsqueeze(1), ends, at)
+        after, before = (
+            policy.velocity(points, at, features[policy].unsqueeze(1)) for policy in (new, old)
+        )
+        change: th.Tensor = old.path.end_time * (after - before).mean(dim=1)
+        return change
+
+    return Shifts(exact, mean_change(grid), mean_change(times))
+
+
+def _rms(values: th.Tensor) -> th.Tensor:
+    return values.square().mean().sqrt()
+
+
+def _correlation(one: th.Tensor, other: th.Tensor) -> th.Tensor:
+    """Pearson's coefficient of two tensors (n,); not a number if one is constant."""
+    return th.corrcoef(th.stack([one, other]))[0, 1]

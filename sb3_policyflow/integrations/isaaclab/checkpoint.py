@@ -1,0 +1,125 @@
+"""A model to go on from: it brings its own hyperparameters, and the statistics saved with it."""
+
+import pickle
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_policyflow.integrations.isaaclab.lab import LabError
+from sb3_policyflow.policyflow import PolicyFlow
+from sb3_policyflow.resilience.saving import ResumeState
+
+FOR_THE_SCRIPT = ("n_steps", "timeout_bootstrap", "seed")
+"""Hyperparameters that decide how the environment is made, and for how long to train."""
+
+
+class Checkpoint(NamedTuple):
+    """What a run goes on from.
+
+    ``hyperparameters`` are those that :data:`FOR_THE_SCRIPT` names. ``statistics`` have no
+    environment yet, and are None if the model was trained without.
+    """
+
+    path: Path
+    hyperparameters: dict[str, Any]
+    statistics: VecNormalize | None
+
+
+def read_checkpoint(path: Path, overrides: Sequence[str]) -> Checkpoint:
+    """See whether a model can be gone on from, before the simulator starts.
+
+    :param path: Its file, whose name may be given without its ``.zip``.
+    :param overrides: What the command line changes in IsaacLab's configuration.
+    :raises LabError: If it or its statistics cannot be loaded, or its hyperparameters are to be
+        changed.
+    """
+    path = find_checkpoint(path)
+    changes = [change for change in overrides if _is_of_the_model(change)]
+    if changes:
+        raise LabError(
+            "A model that is gone on from has its own hyperparameters: leave out "
+            f"{', '.join(changes)}, or --checkpoint."
+        )
+    with _refused_if_unreadable(path):
+        model = PolicyFlow.load(path, device="cpu")
+        data, _, _ = load_from_zip_file(path, device="cpu")
+    hyperparameters = {name: getattr(model, name) for name in FOR_THE_SCRIPT}
+    return Checkpoint(path, hyperparameters, _read_statistics(path, data or {}))
+
+
+def find_checkpoint(path: Path) -> Path:
+    """The file of a saved model, whose name may be given without its ``.zip``.
+
+    :raises LabError: If there is none.
+    """
+    for candidate in (path, path.with_name(f"{path.name}.zip")):
+        if candidate.is_file():
+            return candidate
+    raise LabError(f"There is no model {path} to go on from: correct --checkpoint.")
+
+
+def _is_of_the_model(override: str) -> bool:
+    """Whether it changes a hyperparameter; how long to train is none of the model's.
+
+    Version 3 can also replace all of them at once.
+
+    >>> [_is_of_the_model(o) for o in ("++agent.gamma=0.9", "agent.n_timesteps=9", "env.x=1")]
+    [True, False, False]
+    >>> _is_of_the_model("agent=large")
+    True
+    """
+    name = override.lstrip("+~").partition("=")[0]
+    return name.partition(".")[0] == "agent" and name != "agent.n_timesteps"
+
+
+@contextmanager
+def _refused_if_unreadable(path: Path) -> Iterator[None]:
+    """Files hold pickles, which fail with any exception, and at length."""
+    try:
+        yield
+    except Exception as error:
+        reason = str(error).partition("\n")[0]
+        raise LabError(f"{path} cannot be gone on from: {reason}") from error
+
+
+def _read_statistics(checkpoint: Path, data: dict[str, Any]) -> VecNormalize | None:
+    """The statistics of a model, which tells whether it has any.
+
+    What lies beside it may be those of an earlier run, and a file can get lost.
+
+    :param checkpoint: The model's file.
+    :param data: What it holds.
+    :raises LabError: If they are missing, or cannot be loaded.
+    """
+    path = statistics_of(checkpoint)
+    state: ResumeState | None = data.get("resume_state")
+    # SB3 lets users leave that out of a file, which then does not tell.
+    if not (path.is_file() if state is None else state.normalized_returns is not None):
+        return None
+    if not path.is_file():
+        raise LabError(
+            f"{checkpoint} was trained with VecNormalize, but its statistics are not at {path}: "
+            "copy them there."
+        )
+    with _refused_if_unreadable(path), path.open("rb") as file:
+        statistics = pickle.load(file)
+    if not isinstance(statistics, VecNormalize):
+        raise LabError(f"{path} does not hold statistics of VecNormalize: copy them there.")
+    return statistics
+
+
+def statistics_of(checkpoint: Path) -> Path:
+    """Where the statistics of ``VecNormalize`` are that were saved with a model.
+
+    >>> statistics_of(Path("logs/model_98304_steps.zip")).name
+    'model_vecnormalize_98304_steps.pkl'
+    >>> statistics_of(Path("logs/model.zip")).name
+    'model_vecnormalize.pkl'
+    """
+    name = re.sub(r"(_\d+_steps)?$", r"_vecnormalize\1", checkpoint.stem, count=1)
+    return checkpoint.with_name(f"{name}.pkl")

@@ -1,0 +1,75 @@
+"""What an experiment of rl_zoo3 needs for this package's algorithms and environments."""
+
+import functools
+from collections.abc import Callable, Container
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import optuna
+import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_policyflow.integrations.rl_zoo3.vec_env import has_own_vectorization, make_native_vec_env
+
+PACKAGE = Path(__file__).parents[2]
+
+
+def extend_experiment(manager: Any, own_algorithms: Container[str], config_given: bool) -> None:
+    """Adapt a new ``ExperimentManager`` where its run is of this package's concern.
+
+    :param manager: rl_zoo3's ``ExperimentManager``.
+    :param own_algorithms: Names of this package's algorithms.
+    :param config_given: Whether the user said where the hyperparameters are.
+    """
+    env_id = manager.env_name.gym_id
+    is_own_algorithm = manager.algo in own_algorithms
+    if not config_given:
+        manager.config = choose_config(manager.algo, env_id, manager.config)
+    # Another class than DummyVecEnv is somebody's explicit choice.
+    if manager.vec_env_class is DummyVecEnv and has_own_vectorization(
+        gym.spec(env_id), of_this_package=not is_own_algorithm
+    ):
+        manager.vec_env_class = make_native_vec_env
+    if is_own_algorithm:
+        manager.objective = prune_if_diverged(manager.objective)
+
+
+def choose_config(algo: str, env_id: str, theirs: str) -> str:
+    """The file with the hyperparameters of an algorithm in an environment.
+
+    rl_zoo3's own where it names the environment, else this package's where that does, else the
+    one that there is.
+
+    :param theirs: rl_zoo3's file for the algorithm, which need not exist.
+    """
+    ours = hyperparams_folder() / f"{algo}.yml"
+    if not ours.is_file():
+        return theirs
+    if not Path(theirs).is_file():
+        return str(ours)
+    only_ours = env_id in _environments(ours) and env_id not in _environments(Path(theirs))
+    return str(ours) if only_ours else theirs
+
+
+def hyperparams_folder() -> Path:
+    """Where the YAML files are: in the installed package, or beside it in a checkout."""
+    installed = PACKAGE / "hyperparams"
+    return installed if installed.is_dir() else PACKAGE.parent / "hyperparams"
+
+
+def _environments(config: Path) -> set[str]:
+    return set(yaml.safe_load(config.read_text(encoding="utf-8")))
+
+
+def prune_if_diverged(objective: Callable[..., float]) -> Callable[..., float]:
+    """Prune a trial whose numbers overflow, as rl_zoo3 does where they raise a ``ValueError``."""
+
+    @functools.wraps(objective)
+    def prune(trial: Any) -> float:
+        try:
+            return objective(trial)
+        except ArithmeticError as error:
+            raise optuna.TrialPruned(str(error)) from error
+
+    return prune

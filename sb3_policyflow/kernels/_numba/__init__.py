@@ -1,0 +1,23 @@
+"""Kernels that numba compiles when they are first called, and keeps for later processes.
+
+They take arrays of float32, read parameters where they are in memory, and carry few enough rows at
+a time through a network to stay in the caches. Get them from
+:func:`sb3_policyflow.kernels.compiler.kernels`.
+"""
+
+from sb3_policyflow.kernels._numba.embedding import embed, embed_backward
+from sb3_policyflow.kernels._numba.flow import Method, Network, flow
+from sb3_policyflow.kernels._numba.memory import clip, renew
+from sb3_policyflow.kernels._numba.perceptron import backward, forward
+
+__all__ = [
+    "Method",
+    "Network",
+    "backward",
+    "clip",
+    "embed",
+    "embed_backward",
+    "flow",
+    "forward",
+    "renew",
+]

@@ -1,0 +1,140 @@
+"""Activations: loops over formulas that the compiler turns into vector instructions.
+
+All come down to one exponential, and differ from torch's by a few units in the last place.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_policyflow.kernels._numba.options import F, Floats, exact
+from sb3_policyflow.kernels.activations import ELU, LEAKY_RELU, MISH, RELU, SILU, TANH
+
+
+@exact
+def _exp_parts(x: Any) -> Any:
+    """(m, s) with e^x = s (1 + m), where s is a power of two and |m| < 0.42; NaN stays NaN.
+
+    The polynomial is that of Cephes' expf.
+    """
+    x = F(88.0) if x > F(88.0) else x
+    x = F(-87.0) if x < F(-87.0) else x
+    n = np.floor(x * F(1.44269504) + F(0.5))
+    r = (x - n * F(0.693359375)) - n * F(-2.12194440e-4)
+    p = F(1.9875691500e-4)
+    p = p * r + F(1.3981999507e-3)
+    p = p * r + F(8.3334519073e-3)
+    p = p * r + F(4.1665795894e-2)
+    p = p * r + F(1.6666665459e-1)
+    p = p * r + F(5.0000001201e-1)
+    scale = np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return p * (r * r) + r, scale
+
+
+@exact
+def _exp(x: Any) -> Any:
+    m, s = _exp_parts(x)
+    return m * s + s
+
+
+@exact
+def _tanh(x: Any) -> Any:
+    """Cephes' polynomial near zero, 1 - 2 / (e^2|x| + 1) elsewhere."""
+    square = x * x
+    p = F(-5.70498872745e-3)
+    p = p * square + F(2.06390887954e-2)
+    p = p * square + F(-5.37397155531e-2)
+    p = p * square + F(1.33314422036e-1)
+    p = p * square + F(-3.33332819422e-1)
+    near = p * square * x + x
+    far = F(1.0) - F(2.0) / (_exp(F(2.0) * abs(x)) + F(1.0))
+    far = -far if x < F(0.0) else far
+    return far if abs(x) > F(0.625) else near
+
+
+@exact
+def _sigmoid(x: Any) -> Any:
+    return F(1.0) / (F(1.0) + _exp(-x))
+
+
+@exact
+def _elu(x: Any, alpha: Any) -> Any:
+    m, s = _exp_parts(x)
+    return x if x > F(0.0) else alpha * (m * s + (s - F(1.0)))
+
+
+@exact
+def _mish_parts(x: Any) -> Any:
+    """(u, w, 1 / (w + 2)) with u = e^x and w = u (u + 2): mish(x) = x w / (w + 2)."""
+    u = _exp(F(20.0) if x > F(20.0) else x)
+    w = u * (u + F(2.0))
+    return u, w, F(1.0) / (w + F(2.0))
+
+
+@exact
+def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # one loop for each
+    """Apply an activation in place."""
+    if kind == MISH:
+        for i in range(values.size):
+            _, w, inverse = _mish_parts(values[i])
+            values[i] *= w * inverse
+    elif kind == TANH:
+        for i in range(values.size):
+            values[i] = _tanh(values[i])
+    elif kind == RELU:
+        for i in range(values.size):
+            values[i] = F(0.0) if values[i] < F(0.0) else values[i]
+    elif kind == LEAKY_RELU:
+        for i in range(values.size):
+            values[i] = alpha * values[i] if values[i] < F(0.0) else values[i]
+    elif kind == SILU:
+        for i in range(values.size):
+            values[i] *= _sigmoid(values[i])
+    elif kind == ELU:
+        for i in range(values.size):
+            values[i] = _elu(values[i], alpha)
+    else:
+        for i in range(values.size):
+            values[i] = _sigmoid(values[i])
+
+
+@exact
+def activate_with_slopes(  # noqa: C901  # one loop for each
+    kind: int, alpha: Any, values: Floats, slopes: Floats
+) -> None:
+    """Apply an activation in place, and keep its derivatives.
+
+    mish'(x) = w / (w + 2) + 4 x u (u + 1) / (w + 2)^2
+    """
+    if kind == MISH:
+        for i in range(values.size):
+            u, w, inverse = _mish_parts(values[i])
+            gate = w * inverse
+            slopes[i] = gate + F(4.0) * values[i] * (u * (u + F(1.0)) * inverse) * inverse
+            values[i] *= gate
+    elif kind == TANH:
+        for i in range(values.size):
+            values[i] = _tanh(values[i])
+            slopes[i] = F(1.0) - values[i] * values[i]
+    elif kind == RELU:
+        for i in range(values.size):
+            slopes[i] = F(0.0) if values[i] <= F(0.0) else F(1.0)
+            values[i] = F(0.0) if values[i] < F(0.0) else values[i]
+    elif kind == LEAKY_RELU:
+        for i in range(values.size):
+            slopes[i] = F(1.0) if values[i] > F(0.0) else alpha
+            values[i] = alpha * values[i] if values[i] < F(0.0) else values[i]
+    elif kind == SILU:
+        for i in range(values.size):
+            gate = _sigmoid(values[i])
+            slopes[i] = gate * (F(1.0) + values[i] * (F(1.0) - gate))
+            values[i] *= gate
+    elif kind == ELU:
+        for i in range(values.size):
+            y = _elu(values[i], alpha)
+            slopes[i] = F(1.0) if values[i] > F(0.0) else y + alpha
+            values[i] = y
+    else:
+        for i in range(values.size):
+            values[i] = _sigmoid(values[i])
+            slopes[i] = values[i] * (F(1.0) - values[i])

@@ -1,0 +1,73 @@
+import warnings
+
+import gymnasium as gym
+import optuna
+import pytest
+from optuna.samplers import RandomSampler
+from optuna.trial import FixedTrial
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_policyflow import PolicyFlow
+from sb3_policyflow.integrations.rl_zoo3.registration import ALGORITHMS
+
+N_ENVS = [1, 3, 8, 24, 32, 1000, 1024, 4096]
+
+
+@pytest.fixture(params=ALGORITHMS)
+def algo(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def draws(algo: str, n_envs: int, number: int) -> list[tuple[optuna.Trial, dict[str, object]]]:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=RandomSampler(seed=n_envs))
+    trials = [study.ask() for _ in range(number)]
+    return [(trial, ALGORITHMS[algo].sample(trial, 2, n_envs, {})) for trial in trials]
+
+
+@pytest.mark.parametrize("n_envs", N_ENVS)
+def test_sizes_fit_the_environments(algo: str, n_envs: int) -> None:
+    for _, hyperparams in draws(algo, n_envs, 100):
+        rollout = hyperparams["n_steps"] * n_envs
+        assert rollout % hyperparams["batch_size"] == 0
+        assert 8 <= hyperparams["batch_size"] <= rollout // 4
+        assert hyperparams["n_steps"] >= 8
+        assert 2**9 < rollout <= max(2**15, 2**7 * n_envs)
+
+
+@pytest.mark.parametrize("n_envs", [1, 24, 1024])
+def test_raw_values_make_the_same_hyperparameters_again(algo: str, n_envs: int) -> None:
+    for trial, hyperparams in draws(algo, n_envs, 20):
+        again = ALGORITHMS[algo].convert(trial.params)
+        assert again.pop("n_envs") == n_envs
+        assert again == hyperparams
+        assert hyperparams == ALGORITHMS[algo].sample(FixedTrial(trial.params), 2, n_envs, {})
+        for name, value in trial.user_attrs.items():
+            assert hyperparams[name] == value
+
+
+def test_whatever_is_drawn_can_be_constructed_and_learns(algo: str) -> None:
+    """All of it but the long rollouts and many epochs, which are a matter of patience."""
+    env = make_vec_env("Pendulum-v1", n_envs=4)
+    for _, hyperparams in draws(algo, 4, 20):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            ALGORITHMS[algo].algorithm(env=env, policy="MlpPolicy", **hyperparams)  # type: ignore[call-arg]
+        short = {**hyperparams, "n_steps": 8, "batch_size": 16, "n_epochs": 2}
+        ALGORITHMS[algo].algorithm(env=env, policy="MlpPolicy", **short).learn(64)  # type: ignore[call-arg]
+
+
+def test_every_choice_is_drawn_and_reaches_the_policy() -> None:
+    env = gym.make("Pendulum-v1")
+    drawn = [hyperparams for _, hyperparams in draws("policyflow", 1, 100)]
+    assert {params["path"] for params in drawn} == {"rectified", "stochastic", "trigflow"}
+    assert {params["solver"] for params in drawn} == {"euler", "midpoint", "heun", "ab2"}
+    assert {params["desired_kl"] for params in drawn} == {None, 0.005, 0.01, 0.02}
+    spread = [params["policy_kwargs"].get("latent_std") for params in drawn]  # type: ignore[attr-defined]
+    stochastic = [params["path"] == "stochastic" for params in drawn]
+    assert [std is None for std in spread] == stochastic
+    assert all(0.1 <= std <= 1 for std in spread if std is not None)
+    model = PolicyFlow("MlpPolicy", env, **drawn[0])
+    assert model.policy.solver == drawn[0]["solver"]
+    assert model.policy.n_flow_steps == drawn[0]["n_flow_steps"]
+    assert model.policy.embedding_dim == drawn[0]["policy_kwargs"]["embedding_dim"]
