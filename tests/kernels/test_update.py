@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
-from tests.common.test_collection import Clock
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
@@ -18,6 +17,7 @@ from sb3_policyflow.kernels.compiler import kernels
 from sb3_policyflow.kernels.networks import Reader
 from sb3_policyflow.kernels.perceptron import evaluate_perceptron
 from tests.kernels.plain import make_field
+from tests.resilience.test_collection import Clock
 
 MISH = {"net_arch": [32, 16], "activation_fn": th.nn.Mish, "initialization": "glorot"}
 
