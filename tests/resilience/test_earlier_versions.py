@@ -1,11 +1,11 @@
 """What version 0.1 saved loads, acts as it did and learns on as it would have.
 
 ``tests/data/v0.1`` holds, for each algorithm, the model, its policy alone, the statistics of its
-``VecNormalize``, and what 0.1 itself made of them. They were made at commit bd8aa99 with torch 2.13,
-on two Pendulum-v1 with ``max_episode_steps=20``: three rollouts with ``n_steps=32, batch_size=16,
-n_epochs=2, seed=7, clip_range_vf=0.2, desired_kl="lin_0.02_0.005", lr_bounds=(1e-5, 5e-3)``, in
-``policy_kwargs`` ``net_arch=[16, 16], embedding_dim=8, initialisation="glorot"``, and options that
-are not the defaults, under the names that they had:
+``VecNormalize``, and what 0.1 itself made of them. They were made at commit bd8aa99 with torch
+2.13, on two Pendulum-v1 with ``max_episode_steps=20``: three rollouts with ``n_steps=32,
+batch_size=16, n_epochs=2, seed=7, clip_range_vf=0.2, desired_kl="lin_0.02_0.005",
+lr_bounds=(1e-5, 5e-3)``, in ``policy_kwargs`` ``net_arch=[16, 16], embedding_dim=8,
+initialisation="glorot"``, and options that are not the defaults, under the names that they had:
 
 - PolicyFlow: ``path="trigflow", n_times=3, time_average="shift", time_sampler="starts",
   n_flow_steps=4, solver="heun", brownian_coef="lin_0.25_0.05", brownian_reduction="mean",
