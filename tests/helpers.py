@@ -73,3 +73,8 @@ def collect(model: Any) -> Any:
 def n_updates(model: Any) -> int:
     """How many epochs a model has gone through, by its log."""
     return int(model.logger.name_to_value["train/n_updates"])
+
+
+def last_observations(model: Any) -> Any:
+    """The observations that the next rollout starts with; None if it resets the environment."""
+    return model._last_obs

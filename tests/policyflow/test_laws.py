@@ -4,13 +4,13 @@ from typing import Any
 
 import pytest
 import torch as th
+from sb3_policyflow.policyflow.behavior import Behavior
 from torch import nn
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.losses import clipped_surrogate
 from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
-from sb3_policyflow.policyflow.behavior import Behavior
 from sb3_policyflow.policyflow.policies import PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import Probes
 
