@@ -90,6 +90,7 @@ def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     assert expected.std() > 0
 
 
+@pytest.mark.slow
 def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     model = trained(algorithm, "CnnPolicy", make_vec_env(images, 2))
     export(model.policy, tmp_path / "policy.onnx")
@@ -98,6 +99,7 @@ def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", pictures), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env(Robot, 3), norm_obs_keys=["joints"])
     model = trained(algorithm, "MultiInputPolicy", env)
@@ -111,6 +113,7 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [
@@ -169,6 +172,7 @@ np.save("actions.npy", actions)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "kind"), [(PolicyFlow, "onnx"), (DPPO, "pt2")])
 def test_command_line_writes_files_that_load_without_this_package(
     algorithm: type[Any], kind: str, tmp_path: Path

@@ -133,6 +133,7 @@ def test_images(algorithm: type[Any], share: bool) -> None:
     assert model.policy.velocity.hidden[0].in_features == 5 + 64
 
 
+@pytest.mark.slow
 def test_learns_to_copy_its_observation(algorithm: type[Any]) -> None:
     env = make_vec_env(lambda: IdentityEnvBox(eps=0.3), 8)
     options = {"n_steps": 64, "batch_size": 128, "learning_rate": 2e-3, "gamma": 0.4, "seed": 0}

@@ -242,6 +242,7 @@ def test_save_load_clip_range_portable(algorithm: type[Any], tmp_path: Path) -> 
     assert (loaded.clip_range(0.5), loaded.clip_range_vf(0.5)) == (0.3, 0.4)
 
 
+@pytest.mark.slow
 def test_compiled_policy(algorithm: type[Any], tmp_path: Path) -> None:
     model = make(algorithm, seed=0)
     model.policy = th.compile(model.policy, backend="eager")  # others take minutes

@@ -308,6 +308,7 @@ def test_progress_bar(capsys: pytest.CaptureFixture[str]) -> None:
     assert "64/64" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_multigoal_with_the_papers_settings() -> None:
     """Two iterations at full size run through and keep time limits and terminations apart."""
     env = VecMonitor(MultiGoalVecEnv(1024, seed=0))

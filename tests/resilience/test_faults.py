@@ -109,7 +109,9 @@ def test_an_environment_that_raises(tmp_path: Path) -> None:
     assert_saves_and_goes_on(model, tmp_path)
 
 
-@pytest.mark.parametrize("start_method", ["fork", "forkserver"])
+@pytest.mark.parametrize(
+    "start_method", ["fork", pytest.param("forkserver", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(
     ("fault", "cause"),
     [

@@ -49,6 +49,7 @@ def draws() -> list[float]:
 # Exact resume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["PolicyFlow", "FPO", "DPPO"])
 def test_resumed_runs_equal_each_other_and_the_uninterrupted_one(
     algorithm: str, tmp_path: Path
@@ -188,6 +189,7 @@ def test_random_states_kept() -> None:
 # Whole files
 
 
+@pytest.mark.slow
 def test_processes_killed_while_saving_leave_whole_files() -> None:
     said = run_script(SCRIPTS / "kill_during_save.py", 8)
     assert said.startswith("8 kills: 8 files whole")
