@@ -46,7 +46,7 @@ def evaluations_per_action(model: BaseAlgorithm) -> int:
     """Evaluations of the actor's network that one action takes."""
     policy = model.policy
     if isinstance(policy, OdeFlowPolicy):
-        return policy.n_flow_steps * SOLVERS[policy.solver].evaluations
+        return policy.n_flow_steps * SOLVERS[policy.solver].n_stages
     return policy.n_denoising_steps if isinstance(policy, DPPOPolicy) else 1
 
 

@@ -11,7 +11,6 @@ from sb3_policyflow.common.policies import FlowActorCriticPolicy
 from sb3_policyflow.flows import SOLVERS, Path
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.solvers import solver_times
-from sb3_policyflow.kernels.sampler import FlowSampler
 
 
 class OdeFlowPolicy(FlowActorCriticPolicy):
@@ -50,7 +49,6 @@ class OdeFlowPolicy(FlowActorCriticPolicy):
         choose("solver", solver, SOLVERS)
         check_count("n_flow_steps", n_flow_steps, 1)
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
-        self._flow = FlowSampler(solver, n_flow_steps, flow_path.end_time)
 
     def solver_times(self) -> th.Tensor:
         """The solver's time grid, on the policy's device."""
@@ -64,4 +62,10 @@ class OdeFlowPolicy(FlowActorCriticPolicy):
         :param features: The actor's features, shape (n, features_dim).
         :return: phi, shape (n, action_dim).
         """
-        return self._flow.carry(self.velocity, latents, features)
+        return self.velocity.integrate(
+            latents,
+            features,
+            solver=self.solver,
+            n_steps=self.n_flow_steps,
+            end_time=self.path.end_time,
+        )

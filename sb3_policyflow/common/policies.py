@@ -20,9 +20,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common.optimization import make_optimizer
-from sb3_policyflow.kernels.fields import FusedVelocityField
-from sb3_policyflow.kernels.networks import Perceptron, Reader, Reading, is_eager
-from sb3_policyflow.kernels.perceptron import evaluate_perceptron
+from sb3_policyflow.kernels import KernelCritic, make_velocity_field
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -144,14 +142,14 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         # Those of a Gaussian actor, as is the optimizer.
         del self.action_net, self.log_std
         self._build_actor()
-        self._critic = Reading(read_critic)
+        self._kernel_critic = KernelCritic()
         self.optimizer = make_optimizer(
             self.optimizer_class, self.parameters(), lr_schedule(1), self.optimizer_kwargs
         )
 
     def _build_actor(self) -> None:
         """Build what the actor learns, apart from the features extractor."""
-        self.velocity = FusedVelocityField(
+        self.velocity = make_velocity_field(
             self.action_dim,
             self.features_dim,
             net_arch=self._layers("pi"),
@@ -179,8 +177,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
-        network = self._critic.of(self) if is_eager() else None
-        values = None if network is None else evaluate_perceptron(network, features)
+        values = self._kernel_critic(self, features)
         if values is None:
             values = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
@@ -252,18 +249,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )
-
-
-def read_critic(reader: Reader, policy: FlowActorCriticPolicy) -> Perceptron | None:
-    """The critic behind the features, or None if it is not of the kind that kernels know."""
-    reader.children(policy)
-    if type(policy.mlp_extractor) is not MlpExtractor or not reader.is_plain(policy.mlp_extractor):
-        return None
-    reader.children(policy.mlp_extractor)
-    hidden = policy.mlp_extractor.value_net
-    if not reader.is_plain(hidden):
-        return None
-    return reader.perceptron((*reader.children(hidden), policy.value_net))
 
 
 def is_in_mode(module: nn.Module, mode: bool) -> bool:
