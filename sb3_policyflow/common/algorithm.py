@@ -12,20 +12,21 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.checks import Check
 from sb3_policyflow.common.buffers import (
     DictFlowRolloutBuffer,
     FlowRolloutBuffer,
     FlowRolloutBufferSamples,
 )
+from sb3_policyflow.common.checks import Check
 from sb3_policyflow.common.losses import clipped_value_loss, normalize
 from sb3_policyflow.common.optimization import clip_gradients
 from sb3_policyflow.common.options import (
     FORMER_NAMES,
     SHARED_CHECKS,
+    check_algorithm,
     read_loaded_options,
 )
-from sb3_policyflow.common.policies import FlowPolicy, check_flow_spaces
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
 from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics
 from sb3_policyflow.kernels import reason_kernels_are_off
@@ -141,7 +142,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         read_loaded_options(self)
-        self._check_options()
+        check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
         )
@@ -152,23 +153,15 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        self._start_adaptive_learning_rate()
+        start = self.lr_schedule(1.0)
+        if self.desired_kl is None:
+            self.adaptive_learning_rate = None
+        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
+            # Otherwise a saved run continues that began with this learning rate.
+            self.adaptive_learning_rate = start
+        self._adaptive_start = start
         for check in self.model_checks:
             check(self)
-
-    def _check_options(self) -> None:
-        """Refuse what cannot be used, before networks and buffers are made."""
-        name, space = type(self).__name__, getattr(self, "observation_space", None)
-        checks.check_environment(name, self.env, space)
-        check_flow_spaces(self.action_space, self.use_sde)
-        checks.check_policy_class(name, self.policy_class, self.policy_base)
-        twice = sorted(self.policy_options.keys() & self.policy_kwargs.keys())
-        if twice:
-            raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
-        checks.check_options(self)
-        checks.check_batches(self.batch_size, self.n_steps, self.n_envs, self.normalize_advantage)
-        if self.desired_kl is not None and self.value_of("desired_kl") == 0:
-            raise ValueError(f"desired_kl must be positive or None, got {self.desired_kl}.")
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
@@ -187,29 +180,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         # linear schedule with it: a negative learning rate would ascend the loss.
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
 
-    # The adaptive learning rate
-
-    def _start_adaptive_learning_rate(self) -> None:
-        """Start with ``learning_rate``, unless a saved run that started with it continues.
-
-        :raises ValueError: If ``learning_rate`` is a schedule, which would have no effect.
-        """
-        self._lr_adaptation()  # refuses wrong options
-        start = self.lr_schedule(1.0)
-        if self.desired_kl is None:
-            self.adaptive_learning_rate = None
-        elif start != self.lr_schedule(0.0):
-            raise ValueError(
-                "With desired_kl the learning rate follows the divergence of the policy: give the "
-                "learning_rate that it starts with, not a schedule."
-            )
-        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
-            self.adaptive_learning_rate = start
-        self._adaptive_start = start
-
-    def _lr_adaptation(self) -> KLAdaptiveLearningRate:
-        return KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
-
     def _update_learning_rate(
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
@@ -219,13 +189,15 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.logger.record("train/learning_rate", self.adaptive_learning_rate)
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
-    def _adapt_learning_rate(self, kls: list[th.Tensor]) -> None:
+    def _adapt_learning_rate(
+        self, rule: KLAdaptiveLearningRate, kls: list[th.Tensor], trains_actor: bool
+    ) -> None:
         """Move the learning rate, if it is adaptive, by the mean of some divergences."""
-        if self.adaptive_learning_rate is None:
+        # An actor that does not learn gives no reason to learn faster.
+        if self.adaptive_learning_rate is None or not trains_actor:
             return
-        kl = th.stack(kls).mean().item()
-        self.adaptive_learning_rate = self._lr_adaptation().adapt(
-            self.adaptive_learning_rate, kl, self.value_of("desired_kl")
+        self.adaptive_learning_rate = rule.adapt(
+            self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
@@ -241,58 +213,55 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         rollout = self.rollout_buffer.samples()
-        if self.normalize_advantage and self.advantage_scope == "rollout":
-            rollout = rollout._replace(advantages=normalize(rollout.advantages))
+        rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
         update = self._begin_update(rollout)
         self._update_learning_rate(self.policy.optimizer)
         clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
-        adaptation, metrics, kls = self._lr_adaptation(), UpdateMetrics(), list[th.Tensor]()
-        continue_training = True
+        rule = KLAdaptiveLearningRate.of("lr_adaptation_kwargs", self.lr_adaptation_kwargs)
+        metrics, kls = UpdateMetrics(), list[th.Tensor]()
         for _ in range(self.n_epochs):  # line 13
-            if adaptation.window == "epoch":
-                kls.clear()
+            kls = [] if rule.window == "epoch" else kls
             samples = rollout._replace(drawn=update.draw(rollout))  # lines 15 to 17
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
                 features, critic_features = self.policy.actor_critic_features(batch.observations)
                 terms = update.terms(batch, features)  # lines 18, 20 and 21
-                advantages = self._advantages(batch)
+                # Surrogate objective within the trust region
+                advantages = self._normalized(batch.advantages, "minibatch")
                 policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
+                # Value loss, against the TD(lambda) returns
                 values = self.policy.values(critic_features).flatten()
                 value_loss = clipped_value_loss(
                     values, batch.old_values, batch.returns, clip_range_vf
                 )
+                # The entropy bonuses are part of the regularizer
                 loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
-                losses = {"policy_gradient_loss": policy_loss, "value_loss": value_loss}
-                metrics.add_means({**losses, **terms.metrics})
+                metrics.add_means({"policy_gradient_loss": policy_loss, "value_loss": value_loss})
+                metrics.add_means(terms.metrics)
                 kls.append(terms.kl.detach())
-                if self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl:
-                    continue_training = False
-                    self.logger.info(
-                        f"Early stopping due to reaching max kl: {terms.kl.item():.2f}"
-                    )
+                stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
+                if not stop:
+                    self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
+                if stop or rule.interval == "minibatch":
+                    self._adapt_learning_rate(rule, kls[-1:], update.trains_actor)
+                if stop:
+                    self.logger.info(f"Early stopping due to reaching max kl: {kls[-1].item():.2f}")
                     break
-                self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
-                if adaptation.interval == "minibatch":
-                    self._adapt_learning_rate(update, kls[-1:])
             self._n_updates += 1
-            if not continue_training:
-                # The epoch is incomplete, and its last divergence shows that the rate is too high.
-                self._adapt_learning_rate(update, kls[-1:])
+            if stop:
                 break
-            if adaptation.interval == "epoch":
-                self._adapt_learning_rate(update, kls)
+            if rule.interval == "epoch":
+                self._adapt_learning_rate(rule, kls, update.trains_actor)
         self._log_update(loss, th.stack(kls).mean(), metrics)
 
-    def _advantages(self, batch: FlowRolloutBufferSamples) -> th.Tensor:
-        """Advantages of a minibatch, shape (n,)."""
-        per_minibatch = self.normalize_advantage and self.advantage_scope == "minibatch"
-        # A minibatch of one sample has no standard deviation.
-        if per_minibatch and len(batch.advantages) > 1:
-            return normalize(batch.advantages)
-        return batch.advantages
+    def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
+        """Advantages, shape (n,), normalized if this is the scope in which that is done."""
+        # One sample has no standard deviation.
+        if self.normalize_advantage and self.advantage_scope == scope and len(advantages) > 1:
+            return normalize(advantages)
+        return advantages
 
     def _optimize(
         self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
@@ -319,22 +288,16 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
-        logged: dict[str, Any] = {
-            **metrics.summary(),
-            "approx_kl": approx_kl.item(),
-            "loss": loss.item(),
-            "explained_variance": explained_variance(values.flatten(), returns.flatten()),
-            "clip_range": self.value_of("clip_range"),
-        }
-        if self.clip_range_vf is not None:
-            logged["clip_range_vf"] = self.value_of("clip_range_vf")
+        logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
+        logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
         if hasattr(self.policy, "log_std"):
             logged["std"] = self.policy.log_std.exp().mean().item()
-        for name, value in logged.items():
+        logged["clip_range"] = self.value_of("clip_range")
+        if self.clip_range_vf is not None:
+            logged["clip_range_vf"] = self.value_of("clip_range_vf")
+        for name, value in {**metrics.summary(), **logged}.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    # Training
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         prepared = super()._setup_learn(*args, **kwargs)
@@ -352,7 +315,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfFlow:
-        """Train for ``total_timesteps``; see SB3. ``tb_log_name`` is the class's name by default."""
+        """Train for ``total_timesteps``; see SB3. Runs are named after the class by default."""
         name = tb_log_name or type(self).__name__
         return super().learn(
             total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar

@@ -17,8 +17,7 @@ from sb3_policyflow.common.buffers import (
 )
 from sb3_policyflow.flows.choices import choose
 
-
-Check = Callable[[str, object], None]
+Check = Callable[[str, object], object]
 """``check(name, value)`` raises a ``ValueError`` that says what ``name`` must be."""
 
 
@@ -130,6 +129,29 @@ def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any])
             f"{getattr(policy_class, '__name__', policy_class)}: use 'MlpFlowPolicy', "
             "'CnnFlowPolicy' or 'MultiInputFlowPolicy', or derive your own from "
             f"{base.__module__}.{base.__name__}."
+        )
+
+
+def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
+    """Refuse what a flow policy cannot do.
+
+    :raises ValueError: If the actions are not continuous or not floats, or gSDE is asked for.
+    """
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(
+            f"Flow policies need continuous actions (a Box), but the action space is "
+            f"{action_space}: use PPO of stable_baselines3 for it."
+        )
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(
+            f"Flow policies draw real numbers, but the actions are {action_space.dtype}: declare a "
+            "Box of np.float32, and round in the environment (gymnasium.wrappers.TransformAction)."
+        )
+    if use_sde:
+        raise ValueError(
+            "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
+            "leave it out. The noise has options of its own, such as PolicyFlow's "
+            "policy_kwargs=dict(log_std_init=...)."
         )
 
 

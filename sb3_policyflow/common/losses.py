@@ -142,8 +142,8 @@ def clipped_value_loss(
     """Mean squared error of the values, whose change is clipped as in SB3's PPO.
 
     >>> one, three = th.ones(1), th.full((1,), 3.0)
-    >>> clipped_value_loss(three, one, one, None).item(), clipped_value_loss(three, one, one, 0.5).item()
-    (4.0, 0.25)
+    >>> [clipped_value_loss(three, one, one, epsilon).item() for epsilon in (None, 0.5)]
+    [4.0, 0.25]
 
     :param values: Shape (n,).
     :param old_values: Those of the rollout, shape (n,).

@@ -10,9 +10,10 @@ from typing import Any, ParamSpec, TypedDict, cast
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.schedules import Coefficient, parse_schedule
+from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
 
 P = ParamSpec("P")
 FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
@@ -66,6 +67,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "ent_coef": parse_schedule,
     "target_kl": checks.positive_or_none,
     "desired_kl": checks.or_none(parse_schedule),
+    "lr_adaptation_kwargs": KLAdaptiveLearningRate.of,
     "max_grad_norm": checks.or_none(checks.between(-math.inf)),
     "n_steps": checks.at_least(1),
     "n_epochs": checks.at_least(1),
@@ -143,7 +145,7 @@ def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
     options: dict[str, inspect.Parameter] = {}
     for cls in policy_class.__mro__:
         if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
-            parameters = inspect.signature(cls.__init__).parameters
+            parameters = inspect.signature(vars(cls)["__init__"]).parameters
             options |= {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
     return list(options.values())
 
@@ -204,6 +206,33 @@ def read_loaded_options(model: Any) -> None:
     for option in own_options(model.policy_base):
         if option.name in attributes:
             model.policy_options[option.name] = attributes.pop(option.name)
+
+
+def check_algorithm(model: Any) -> None:
+    """Refuse what cannot be used, before networks and buffers are made.
+
+    :param model: An algorithm whose attributes have been set.
+    :raises ValueError: With what to use instead.
+    """
+    name, space = type(model).__name__, getattr(model, "observation_space", None)
+    checks.check_environment(name, model.env, space)
+    checks.check_flow_spaces(model.action_space, model.use_sde)
+    checks.check_policy_class(name, model.policy_class, model.policy_base)
+    twice = sorted(model.policy_options.keys() & model.policy_kwargs.keys())
+    if twice:
+        raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
+    checks.check_options(model)
+    checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
+    if model.desired_kl is None:
+        return
+    if model.value_of("desired_kl") == 0:
+        raise ValueError(f"desired_kl must be positive or None, got {model.desired_kl}.")
+    learning_rate = FloatSchedule(model.learning_rate)
+    if learning_rate(1.0) != learning_rate(0.0):
+        raise ValueError(
+            "With desired_kl the learning rate follows the divergence of the policy: give the "
+            "learning_rate that it starts with, not a schedule."
+        )
 
 
 def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

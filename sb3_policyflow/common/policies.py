@@ -4,7 +4,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
@@ -99,7 +98,7 @@ class FlowPolicy(ActorCriticPolicy):
         initialization: str = "glorot_zero_output",
         random_latents: bool = False,
     ) -> None:
-        check_flow_spaces(action_space, use_sde)
+        checks.check_flow_spaces(action_space, use_sde)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
@@ -285,29 +284,6 @@ def is_in_mode(module: nn.Module, mode: bool) -> bool:
     if module.training is not mode:
         return False
     return all(is_in_mode(child, mode) for child in module._modules.values() if child is not None)
-
-
-def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
-    """Refuse what a flow policy cannot do.
-
-    :raises ValueError: If the actions are not continuous or not floats, or gSDE is asked for.
-    """
-    if not isinstance(action_space, spaces.Box):
-        raise ValueError(
-            f"Flow policies need continuous actions (a Box), but the action space is "
-            f"{action_space}: use PPO of stable_baselines3 for it."
-        )
-    if not np.issubdtype(action_space.dtype, np.floating):
-        raise ValueError(
-            f"Flow policies draw real numbers, but the actions are {action_space.dtype}: declare a "
-            "Box of np.float32, and round in the environment (gymnasium.wrappers.TransformAction)."
-        )
-    if use_sde:
-        raise ValueError(
-            "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
-            "leave it out. The noise has options of its own, such as PolicyFlow's "
-            "policy_kwargs=dict(log_std_init=...)."
-        )
 
 
 def policy_aliases(

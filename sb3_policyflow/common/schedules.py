@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -14,7 +15,7 @@ Coefficient = float | str | Schedule
 _LINEAR = re.compile(r"lin_(?P<start>[^_]+)(_(?P<end>[^_]+))?")
 
 
-def parse_schedule(name: str, value: Coefficient) -> FloatSchedule:
+def parse_schedule(name: str, value: object) -> FloatSchedule:
     """Turn what the user gave for a coefficient into a function of the remaining progress.
 
     >>> parse_schedule("brownian_coef", "lin_0.25")(0.5)
@@ -38,7 +39,7 @@ def parse_schedule(name: str, value: Coefficient) -> FloatSchedule:
     return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
 
 
-def _ends(name: str, value: float | str) -> tuple[float, float]:
+def _ends(name: str, value: Any) -> tuple[float, float]:
     """First and last value of a constant or linear schedule."""
     try:
         linear = _LINEAR.fullmatch(value) if isinstance(value, str) else None
@@ -90,6 +91,20 @@ class KLAdaptiveLearningRate:
             raise ValueError(f"factor must be greater than 1, got {self.factor}.")
         if self.bounds[0] <= 0:
             raise ValueError(f"bounds must be positive, got {self.bounds}.")
+
+    @classmethod
+    def of(cls, name: str, options: Any) -> "KLAdaptiveLearningRate":
+        """The rule with these options.
+
+        :param name: What the options are called, for error messages.
+        :param options: A dictionary of the parameters, or None for the defaults.
+        :raises ValueError: If an option is unknown or cannot be used.
+        """
+        try:
+            return cls(**(options or {}))
+        except TypeError as error:
+            known = ", ".join(cls.__dataclass_fields__)
+            raise ValueError(f"{name} must be a dictionary of {known}, got {options!r}.") from error
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
         """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""

@@ -57,7 +57,8 @@ class Interpolant(ABC):
         :param latents: z, shape (..., dim).
         :param endpoints: phi, shape (..., dim).
         :param times: t, shape (...), which broadcasts with the leading shape of the others.
-        :param noise: h ~ N(0, I), for stochastic interpolants; drawn if not given. Others ignore it.
+        :param noise: h ~ N(0, I), for stochastic interpolants, drawn if not given; others ignore
+            it.
         :return: x_t, shape (..., dim).
         """
         return self._combine(self.coefficients(times), latents, endpoints, noise)

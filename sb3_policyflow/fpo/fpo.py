@@ -183,7 +183,7 @@ class FPOUpdate(FlowUpdate):
             error = times.unsqueeze(-1) * error
         squares = error.square()
         sums = self.algorithm.loss_reduction == "sum"
-        losses = squares.sum(-1) if sums else squares.mean(-1)
+        losses: th.Tensor = squares.sum(-1) if sums else squares.mean(-1)
         clamp = self.algorithm.loss_clamp
         return losses if clamp is None else losses.clamp(max=clamp)
 

@@ -104,8 +104,8 @@ class PolicyFlowPolicy(BaseFlowPolicy):
             raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
         if self.flow.interpolant.stochastic:
             raise ValueError(
-                f"With interpolant={self.interpolant!r} the latents' standard deviation is 1: leave "
-                "out latent_std, or use interpolant='rectified' or interpolant='trigflow'."
+                f"With interpolant={self.interpolant!r} the latents' standard deviation is 1: "
+                "leave out latent_std, or use interpolant='rectified' or interpolant='trigflow'."
             )
 
     def _build_actor(self) -> None:
