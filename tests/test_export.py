@@ -117,8 +117,8 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [
-        (PolicyFlow, {"path": "trigflow", "solver": "rk4"}),
-        (PolicyFlow, {"path": "rectified", "solver": "ab2"}),
+        (PolicyFlow, {"interpolant": "trigflow", "solver": "rk4"}),
+        (PolicyFlow, {"interpolant": "rectified", "solver": "ab2"}),
         (FPO, {"solver": "heun"}),
         (DPPO, {"process": "flow"}),
     ],

@@ -1,6 +1,6 @@
 import pytest
 
-from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
+from sb3_policyflow.common.schedules import KLAdaptiveLearningRate
 
 RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))
 
@@ -28,8 +28,8 @@ def test_rule(learning_rate: float, kl: float, expected: float) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"factor": 1.0}, "lr_factor must be greater than 1"),
-        ({"bounds": (1e-2, 1e-6)}, "lr_bounds must be two numbers in order"),
+        ({"factor": 1.0}, "factor must be greater than 1"),
+        ({"bounds": (1e-2, 1e-6)}, "bounds must be two numbers in order"),
     ],
 )
 def test_senseless_rules_are_refused(options: dict[str, float], message: str) -> None:

@@ -15,11 +15,11 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch.nn.utils import parameters_to_vector
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from tests.helpers import SMALL, TINY, TWO_EPOCHS, train, weights
 
 FPO_PLUS_PLUS: dict[str, Any] = {
-    "probe_average": "objective",
+    "mc_average": "objective",
     "loss_target": "velocity",
     "loss_reduction": "sum",
     "trust_region": "aspo",
@@ -36,7 +36,7 @@ FLOW_CHAIN: dict[str, Any] = {
 }
 TRIGFLOW: dict[str, Any] = {
     "brownian_coef": "lin_0.25_0.05",
-    "path": "trigflow",
+    "interpolant": "trigflow",
     "n_flow_steps": 4,
     "solver": "rk4",
     "policy_kwargs": {"embedding_dim": 8, "log_std_bounds": (-5.0, 2.0), "latent_std": 0.5},

@@ -10,14 +10,16 @@ from gymnasium import spaces
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.flows import PATHS, Rectified, StochasticInterpolant, VelocityField
+from sb3_policyflow.flows import INTERPOLANTS, Rectified, StochasticInterpolant, VelocityField
+from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from sb3_policyflow.policyflow.uniform import UniformTargets
+from tests.helpers import perturb
 
 GAUSSIAN: dict[str, Any] = {
     "gaussian": True,
     "n_flow_steps": 1,
     "solver": "euler",
-    "time_sampler": "starts",
+    "time_sampler": "grid_without_end",
 }
 
 
@@ -26,7 +28,7 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
     model = PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=64, seed=0, ent_coef=0.01, **GAUSSIAN)
     policy = model.policy
     model.learn(64)
-    rollout = model._rollout()
+    rollout = model.rollout_buffer.samples()
     features = policy.actor_features(rollout.observations)
     zeros = th.zeros(64, 1)
 
@@ -40,11 +42,10 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
         actions, record = policy.sample_actions(features)
         old = gaussian()
         rollout = rollout._replace(actions=actions, record=record)
-        behavior = model._behavior(rollout)
-        probes = model._draw_probes(rollout, behavior)
-        for parameter in policy.parameters():
-            parameter += 0.05 * th.randn_like(parameter)
-        terms = model._policy_terms(rollout._replace(probes=probes), features, behavior)
+        update = PolicyFlowUpdate(model, rollout)
+        drawn = update.draw(rollout)
+        perturb(policy, 0.05)
+        terms = update.terms(rollout._replace(drawn=drawn), features)
         new = gaussian()
     assert th.equal(record.latents, zeros)
     th.testing.assert_close(record.endpoints, old.mean)
@@ -81,19 +82,19 @@ def test_uniform_targets_make_actions_uniform(latent_std: float) -> None:
     assert points[:, 0].quantile(0.99).item() < 3.4
 
 
-@pytest.mark.parametrize("path", ["rectified", "trigflow"])
-def test_uniform_loss_vanishes_for_the_field_that_it_asks_for(path: str) -> None:
+@pytest.mark.parametrize("name", ["rectified", "trigflow"])
+def test_uniform_loss_vanishes_for_the_field_that_it_asks_for(name: str) -> None:
     """With a single action u the field dx/dt is a function of x and t, and meets the target."""
-    the_path = PATHS[path]()
+    interpolant = INTERPOLANTS[name]()
     box = spaces.Box(2.0, 2.0 + 1e-6, (1,))
 
     class Exact(VelocityField):
         def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
-            latent, endpoint, _ = (c.unsqueeze(-1) for c in the_path.coefficients(times))
+            latent, endpoint, _ = (c.unsqueeze(-1) for c in interpolant.coefficients(times))
             latents = (points - 2.0 * endpoint) / latent
-            return the_path.derivative(latents, th.full_like(points, 2.0), times)
+            return interpolant.derivative(latents, th.full_like(points, 2.0), times)
 
-    loss = UniformTargets(box, the_path).loss(Exact(1, 1), th.zeros(1000, 1))
+    loss = UniformTargets(box, interpolant).loss(Exact(1, 1), th.zeros(1000, 1))
     assert loss.item() < 1e-3
 
 
@@ -103,8 +104,10 @@ def test_uniform_noise_is_added_to_the_loss_and_logged() -> None:
     assert model.logger.name_to_value["train/uniform_noise_loss"] > 0
 
 
-def test_uniform_noise_needs_a_path_without_noise() -> None:
-    with pytest.raises(ValueError, match="path without noise of its own"):
+def test_uniform_noise_needs_an_interpolant_without_noise() -> None:
+    with pytest.raises(ValueError, match="interpolant without noise of its own"):
         UniformTargets(spaces.Box(-1, 1, (1,)), StochasticInterpolant())
-    with pytest.raises(ValueError, match="path without noise of its own"):
-        PolicyFlow("MlpPolicy", gym.make("Pendulum-v1"), path="stochastic", uniform_noise_coef=0.1)
+    with pytest.raises(ValueError, match="interpolant without noise of its own"):
+        PolicyFlow(
+            "MlpPolicy", gym.make("Pendulum-v1"), interpolant="stochastic", uniform_noise_coef=0.1
+        )

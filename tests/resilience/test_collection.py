@@ -24,19 +24,19 @@ class Clock(gym.Env[Any, Any]):
         self.action_space = spaces.Box(-1, 1, (1,))
         self.limit, self.ends = limit, ends
 
-    def observation(self) -> Any:
+    def _obs(self) -> Any:
         obs = np.array([self.time], dtype=np.float32)
         return {"time": obs} if self.as_dict else obs
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.time = 0
-        return self.observation(), {}
+        return self._obs(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.time += 1
         over = self.time >= self.limit
-        return self.observation(), 1.0, over and self.ends, over and not self.ends, {}
+        return self._obs(), 1.0, over and self.ends, over and not self.ends, {}
 
 
 def clocks(as_dict: bool = False) -> DummyVecEnv:
