@@ -118,14 +118,14 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [
-        (PolicyFlow, {"path": "trigflow", "solver": "rk4"}),
-        (PolicyFlow, {"path": "rectified", "solver": "ab2"}),
+        (PolicyFlow, {"interpolant": "trigflow", "solver": "rk4"}),
+        (PolicyFlow, {"interpolant": "rectified", "solver": "ab2"}),
         (FPO, {"solver": "heun"}),
         (DPPO, {"process": "flow"}),
     ],
     ids=str,
 )
-def test_latents_are_carried_as_the_policy_carries_them(
+def test_latents_are_transported_as_by_the_policy(
     algorithm: type[Any], options: dict[str, Any], tmp_path: Path
 ) -> None:
     model = trained(algorithm, "MlpPolicy", "Pendulum-v1", **options)
@@ -134,7 +134,7 @@ def test_latents_are_carried_as_the_policy_carries_them(
     latents = np.random.randn(5, 1).astype(np.float32)
     with th.no_grad():
         features = model.policy.actor_features(th.as_tensor(obs))
-        endpoints = model.policy.carry(th.as_tensor(latents), features).clamp(-2, 2)
+        endpoints = model.policy.transport(th.as_tensor(latents), features).clamp(-2, 2)
     actions = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
     np.testing.assert_allclose(actions, endpoints, atol=1e-5)
     assert np.ptp(actions) > 0.1
