@@ -201,37 +201,23 @@ def assert_same(one, other):
             np.testing.assert_array_equal(value, other[key])
 
 
-# Registration, in processes of their own
+# Registration
 
 
-def run(code):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-
-
+@pytest.mark.slow
 def test_stock_mazes_are_registered_on_request_only():
-    done = run(
-        "import sys, gymnasium as gym, sb3_policyflow\n"
-        "from sb3_policyflow.envs import ensure_registered\n"
-        "assert 'gymnasium_robotics' not in sys.modules and 'mujoco' not in sys.modules\n"
-        "ensure_registered('CartPole-v1'); ensure_registered('MultiGoal-v0')\n"
-        f"ensure_registered('{ENV_ID}')\n"
-        "assert 'gymnasium_robotics' not in sys.modules\n"
-        f"ensure_registered('{STOCK_ID}'); ensure_registered('{STOCK_ID}')\n"
-        f"gym.make('{STOCK_ID}')"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize("make", [f"ensure_registered('{STOCK_ID}')", f"gym.make('{ENV_ID}')"])
-def test_a_missing_extra_is_named_in_one_sentence(make):
-    done = run(
-        "import sys; sys.modules['gymnasium_robotics'] = None\n"
-        "import gymnasium as gym\n"
-        "from sb3_policyflow.envs import ensure_registered\n" + make
-    )
-    last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("gymnasium.error.DependencyNotInstalled: PointMaze")
-    assert last.endswith("pip install 'sb3-policyflow[robotics]'")
+    code = f"""
+import sys, gymnasium as gym, sb3_policyflow
+from sb3_policyflow.envs import ensure_registered
+assert not {{"gymnasium_robotics", "mujoco"}} & set(sys.modules)
+for env_id in ("CartPole-v1", "MultiGoal-v0", "{ENV_ID}"):
+    ensure_registered(env_id)
+assert "gymnasium_robotics" not in sys.modules
+for _ in range(2):
+    ensure_registered("{STOCK_ID}")
+gym.make("{STOCK_ID}")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_mistyped_maze_gets_the_nearest_names():
