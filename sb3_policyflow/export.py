@@ -19,14 +19,10 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
-from sb3_policyflow.dppo import DPPO
-from sb3_policyflow.fpo import FPO
-from sb3_policyflow.policyflow import PolicyFlow
 
 Observations = th.Tensor | dict[str, th.Tensor]
-ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO, DPPO)
 
 
 class NormalizeObservation(nn.Module):
@@ -198,7 +194,7 @@ def load_policy(path: str | Path) -> FlowActorCriticPolicy:
     """
     data, _, _ = load_from_zip_file(path, device="cpu")
     policy_class = (data or {}).get("policy_class", object)
-    for algorithm in ALGORITHMS:
+    for algorithm in ALGORITHMS.values():
         if issubclass(policy_class, algorithm.policy_base):
             return algorithm.load(path, device="cpu").policy
     raise ValueError(

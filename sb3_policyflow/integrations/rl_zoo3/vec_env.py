@@ -17,6 +17,7 @@ EnvFn = Callable[[], gym.Env[Any, Any]]
 def has_own_vectorization(spec: EnvSpec, of_this_package: bool = False) -> bool:
     """Whether an environment says how to step many of its kind.
 
+    :param spec: The environment's registration.
     :param of_this_package: Whether only this package's environments count.
     """
     if spec.vector_entry_point is None:
@@ -25,10 +26,11 @@ def has_own_vectorization(spec: EnvSpec, of_this_package: bool = False) -> bool:
 
 
 def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
-    """Make the vectorized environment that stands for these environments, with one monitor file.
+    """Make one batch of environments in place of single ones, with one monitor file.
 
-    They are as SB3's ``make_vec_env`` makes them. A ``DummyVecEnv`` if their own vectorization
-    cannot stand for them: if a wrapper is around them, or if it does not reset in the same step.
+    The single ones are as SB3's ``make_vec_env`` makes them. The result is a ``DummyVecEnv`` of
+    them if the batch would differ: if wrappers are around them, or if the batch does not reset an
+    environment in the step in which its episode ends.
 
     :param env_fns: What makes each environment; all are alike.
     :param kwargs: For ``DummyVecEnv``.

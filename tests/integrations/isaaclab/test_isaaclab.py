@@ -58,7 +58,7 @@ def forget_isaaclab() -> None:
 
 def run_script(version: str | None, folder: Path, *arguments: str) -> str:
     """Run the script in a process of its own, and return what it printed."""
-    paths = [FAKES.parents[2], FAKES / "common", *([FAKES / version] if version else [])]
+    paths = [FAKES.parents[3], FAKES / "common", *([FAKES / version] if version else [])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
     command = [sys.executable, "-m", "sb3_policyflow.integrations.isaaclab", *arguments]
     done = subprocess.run(
@@ -133,7 +133,7 @@ def test_lost_statistics_are_missed_before_the_simulator_starts(
     statistics.write_bytes(statistics.read_bytes()[:9])
     monkeypatch.setattr(lab, "check_task", lambda task, agent: pytest.fail("has started"))
     resumed = [*common, "--checkpoint", "out/model.zip"]
-    assert_refused(resumed, f"{statistics} cannot be gone on from: ")
+    assert_refused(resumed, f"{statistics} cannot be resumed: ")
     statistics.write_bytes(pickle.dumps({}))
     assert_refused(resumed, f"{statistics} does not hold statistics of VecNormalize")
     statistics.unlink()
@@ -200,14 +200,14 @@ def test_what_cannot_be_gone_on_from_is_said_before_the_simulator_starts(
     common = ["--task", TASKS[version], "--num_envs", "16", "--max_iterations", "1", "--checkpoint"]
     assert_refused([*common, "no/model.zip"], "There is no model no/model.zip")
     Path("empty.zip").touch()
-    assert_refused([*common, "empty.zip"], "empty.zip cannot be gone on from: ")
+    assert_refused([*common, "empty.zip"], "empty.zip cannot be resumed: ")
     PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("model.zip")
     with ZipFile("model.zip") as whole, ZipFile("other.zip", "w") as other:
         for name in whole.namelist():
             other.writestr(name, b"{}" if name.endswith(".pth") else whole.read(name))
-    assert_refused([*common, "other.zip"], "other.zip cannot be gone on from: ")
+    assert_refused([*common, "other.zip"], "other.zip cannot be resumed: ")
     FPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("fpo.zip")
-    assert_refused([*common, "fpo.zip"], "fpo.zip cannot be gone on from: ", "not FPOPolicy")
+    assert_refused([*common, "fpo.zip"], "fpo.zip cannot be resumed: ", "not FPOPolicy")
     assert_refused([*common, "model", "agent=large"], "leave out agent=large, or --checkpoint")
     changes = ["agent.gamma=0.9", "env.x=1", "agent.n_timesteps=9"]
     assert_refused([*common, "model.zip", *changes], "leave out agent.gamma=0.9, or --checkpoint")
@@ -265,7 +265,7 @@ def test_an_isaaclab_that_lacks_something_shows_what() -> None:
         (
             "two",
             ["--task", TASKS["two"], "agent.timeout_bootstrap=terminal"],
-            ["does not tell the last observation", "agent.timeout_bootstrap=current"],
+            ["does not return the last observation", "agent.timeout_bootstrap=current"],
         ),
     ],
 )
