@@ -104,8 +104,11 @@ def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
     :return: The trained model.
     """
     config = configured.env
+    if options.num_envs is not None:
+        config.scene.num_envs = options.num_envs
+    if getattr(options, "device", None) is not None:
+        config.sim.device = options.device
     saved = {} if options.checkpoint is None else options.checkpoint.hyperparameters
-    apply_options(config, options)
     agent, n_timesteps, normalization = read_agent(
         {**configured.agent, **saved}, config.scene.num_envs, options.max_iterations, options.seed
     )
@@ -117,14 +120,6 @@ def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
         return train(venv, agent, n_timesteps, normalization, options)
     finally:
         env.close()
-
-
-def apply_options(config: Any, options: argparse.Namespace) -> None:
-    """Change the environment's configuration as the command line says."""
-    if options.num_envs is not None:
-        config.scene.num_envs = options.num_envs
-    if getattr(options, "device", None) is not None:
-        config.sim.device = options.device
 
 
 def read_agent(

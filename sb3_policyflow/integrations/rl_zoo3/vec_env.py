@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
@@ -42,6 +42,7 @@ def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
 
 
 def _vectorize(sample: Monitor, num_envs: int) -> VecEnv | None:
+    """A batch of environments like the sample, or None if it would differ from single ones."""
     spec = sample.env.spec  # with the user's env_kwargs
     assert spec is not None
     if spec.additional_wrappers:
@@ -50,11 +51,7 @@ def _vectorize(sample: Monitor, num_envs: int) -> VecEnv | None:
     if vector_env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         vector_env.close()
         return None
-    return _monitor(vector_env, sample)
-
-
-def _monitor(vector_env: VectorEnv[Any, Any, Any], sample: Monitor) -> VecEnv:
-    """Record episodes in the file that the sample would have written to."""
+    # Record episodes in the file that the sample would have written to.
     writer = sample.results_writer
     filename = None if writer is None else str(writer.file_handler.name)
     return VecMonitor(GymVectorVecEnv(vector_env), filename, sample.info_keywords)
