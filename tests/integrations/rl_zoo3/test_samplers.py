@@ -51,6 +51,7 @@ def test_raw_values_make_the_same_hyperparameters_again(algo: str, n_envs: int) 
             assert hyperparams[name] == value
 
 
+@pytest.mark.slow
 def test_whatever_is_drawn_can_be_constructed_and_learns(algo: str) -> None:
     """All of it but the long rollouts and many epochs, which are a matter of patience."""
     env = make_vec_env("Pendulum-v1", n_envs=4)
