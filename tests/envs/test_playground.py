@@ -3,12 +3,14 @@
 import os
 import subprocess
 import sys
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from numpy.typing import NDArray
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
@@ -28,31 +30,31 @@ N_ENVS, LIMIT = 4, 5
 CARTPOLE = "CartpoleBalance"
 
 
-def engine(task):
+def engine(task: str) -> Any:
     return registry.load(task, config_overrides={"impl": "jax"})
 
 
-def row(tree, index):
+def row(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def draw_actions(env, n_steps, seed=0):
+def draw_actions(env: Any, n_steps: int, seed: int = 0) -> NDArray[np.float64]:
     return np.random.default_rng(seed).uniform(-1, 1, (n_steps, *env.action_space.shape))
 
 
 @pytest.fixture(scope="module")
-def cartpoles():
+def cartpoles() -> PlaygroundVectorEnv:
     """One small batch with short episodes for many tests: each compilation takes seconds."""
     return PlaygroundVectorEnv(CARTPOLE, N_ENVS, max_episode_steps=LIMIT)
 
 
 @pytest.fixture(scope="module")
-def engine_step():
+def engine_step() -> Any:
     return jax.jit(engine(CARTPOLE).step)
 
 
 @pytest.mark.parametrize("task", PLAYGROUND_TASKS)
-def test_steps_as_the_engine_does(task):
+def test_steps_as_the_engine_does(task: str) -> None:
     """From each state that is passed through: small differences of contacts would add up."""
     env = gym.make_vec(f"Playground/{task}-v0", 2)
     theirs = engine(task)
@@ -74,7 +76,9 @@ def test_steps_as_the_engine_does(task):
             np.testing.assert_allclose(rewards[i], expected.reward, rtol=1e-4, atol=1e-5)
 
 
-def test_the_limit_truncates_and_resets_at_its_step(cartpoles, engine_step):
+def test_the_limit_truncates_and_resets_at_its_step(
+    cartpoles: PlaygroundVectorEnv, engine_step: Any
+) -> None:
     first, _ = cartpoles.reset(seed=0)
     actions = draw_actions(cartpoles, LIMIT).astype(np.float32)
     for action in actions[:-1]:
@@ -97,7 +101,7 @@ def test_the_limit_truncates_and_resets_at_its_step(cartpoles, engine_step):
     assert not cartpoles.step(actions[0])[3].any(), "the clock starts anew"
 
 
-def starts(env, seed, n_episodes):
+def starts(env: Any, seed: int, n_episodes: int) -> NDArray[np.float32]:
     """Observations that episodes start with, shape (n_episodes, num_envs, obs_dim)."""
     found = [env.reset(seed=seed)[0]]
     for action in draw_actions(env, LIMIT * (n_episodes - 1)):
@@ -107,13 +111,13 @@ def starts(env, seed, n_episodes):
     return np.array(found)
 
 
-def test_each_episode_starts_in_a_state_of_its_own(cartpoles):
+def test_each_episode_starts_in_a_state_of_its_own(cartpoles: PlaygroundVectorEnv) -> None:
     found = starts(cartpoles, 0, 6)
     assert found.shape == (6, N_ENVS, 5)
     assert len(np.unique(found.reshape(-1, 5), axis=0)) == 6 * N_ENVS
 
 
-def test_a_seed_repeats_and_another_differs(cartpoles):
+def test_a_seed_repeats_and_another_differs(cartpoles: PlaygroundVectorEnv) -> None:
     once, again, other = starts(cartpoles, 7, 3), starts(cartpoles, 7, 3), starts(cartpoles, 8, 3)
     np.testing.assert_array_equal(once, again)
     assert (once != other).any(axis=-1).all()
@@ -121,13 +125,13 @@ def test_a_seed_repeats_and_another_differs(cartpoles):
     assert (unseeded[0] != unseeded[1]).any()
 
 
-def ends(env, n_steps):
+def ends(env: Any, n_steps: int) -> list[list[int]]:
     """The steps, from 1, at which each environment's episodes end."""
     dones = [env.step(np.zeros((N_ENVS, 1)))[2] for _ in range(n_steps)]
     return [(np.flatnonzero(column) + 1).tolist() for column in np.array(dones).T]
 
 
-def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
+def test_first_episodes_end_at_random_steps_if_asked(cartpoles: PlaygroundVectorEnv) -> None:
     env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
     found = []
     for seed in (0, 1, 2, 3, 4, 0):
@@ -143,7 +147,9 @@ def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
     assert ends(env, 2 * LIMIT) == [[LIMIT, 2 * LIMIT]] * N_ENVS
 
 
-def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
+def test_a_broken_simulation_ends_that_episode_only(
+    cartpoles: PlaygroundVectorEnv, engine_step: Any
+) -> None:
     cartpoles.reset(seed=0)
     actions = draw_actions(cartpoles, 2 + LIMIT).astype(np.float32)
     cartpoles.step(actions[0])
@@ -166,7 +172,7 @@ def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
     assert ends.sum(axis=0).tolist() == [1, 1, 1, 1]
 
 
-def test_sb3_sees_the_ends_of_episodes(cartpoles):
+def test_sb3_sees_the_ends_of_episodes(cartpoles: PlaygroundVectorEnv) -> None:
     cartpoles.reset(seed=0)
     env = VecMonitor(GymVectorVecEnv(cartpoles))
     env.reset()
@@ -184,7 +190,7 @@ def test_sb3_sees_the_ends_of_episodes(cartpoles):
     assert steps[-1][3][0]["episode"]["l"] == LIMIT
 
 
-def test_a_step_is_traced_once(monkeypatch):
+def test_a_step_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     env = PlaygroundVectorEnv("PendulumSwingup", 2, max_episode_steps=3)
     traced = []
     original = env.batch.env.step
@@ -200,7 +206,7 @@ def test_a_step_is_traced_once(monkeypatch):
     assert len(traced) == n_traced
 
 
-def test_policyflow_learns_with_normalization(cartpoles):
+def test_policyflow_learns_with_normalization(cartpoles: PlaygroundVectorEnv) -> None:
     env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
     model = sb3_policyflow.PolicyFlow("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2)
     before = [parameter.clone() for parameter in model.policy.parameters()]
@@ -214,7 +220,7 @@ def test_policyflow_learns_with_normalization(cartpoles):
     assert np.isfinite(env.obs_rms.mean).all()
 
 
-def test_tensors_share_memory_and_equal_arrays(cartpoles):
+def test_tensors_share_memory_and_equal_arrays(cartpoles: PlaygroundVectorEnv) -> None:
     actions = draw_actions(cartpoles, 2 * LIMIT).astype(np.float32)
     first, _ = cartpoles.reset(seed=4)
     arrays = [cartpoles.step(action) for action in actions]
@@ -234,7 +240,7 @@ def test_tensors_share_memory_and_equal_arrays(cartpoles):
 
 
 @pytest.mark.filterwarnings("ignore:.*not within the observation space|.*gym.make.*")
-def test_check_env():
+def test_check_env() -> None:
     env = gym.make(f"Playground/{CARTPOLE}-v0", max_episode_steps=20)
     sb3_check_env(env)
     gymnasium_check_env(env.unwrapped, skip_render_check=True)
@@ -247,7 +253,7 @@ def test_check_env():
     assert (type(terminated), type(truncated)) == (bool, bool)
 
 
-def test_bad_input_is_refused(cartpoles):
+def test_bad_input_is_refused(cartpoles: PlaygroundVectorEnv) -> None:
     with pytest.raises(ValueError, match=r"actions of shape \(4, 1\), not \(4,\)"):
         cartpoles.step(np.zeros(N_ENVS))
     with pytest.raises(ValueError, match="takes no options"):
@@ -279,7 +285,7 @@ assert (frame != first).mean() > 0.001
 
 
 @pytest.mark.parametrize("backend", ["egl", "glfw"])
-def test_pictures_or_one_sentence(backend):
+def test_pictures_or_one_sentence(backend: str) -> None:
     """Without a display, which glfw needs and egl does not."""
     variables = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
     done = subprocess.run(

@@ -1,5 +1,7 @@
 """Settings of MuJoCo Playground's tasks, and tasks that users add. `make test-playground`."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ STOCK_TASKS = all_tasks()
 ROBOT = "Go1JoystickFlatTerrain"
 
 
-def test_the_task_settings_can_be_changed():
+def test_the_task_settings_can_be_changed() -> None:
     env = PlaygroundEnv(
         "CartpoleBalance", config_overrides={"action_repeat": 2, "episode_length": 6}
     )
@@ -50,7 +52,7 @@ def test_the_task_settings_can_be_changed():
         {"reward_config": {"scales": {"tracking_lin_vel": 9.0}}},
     ],
 )
-def test_settings_within_settings_can_be_changed(overrides):
+def test_settings_within_settings_can_be_changed(overrides: dict[str, Any]) -> None:
     before = task_config(ROBOT, {}).to_dict()
     after = task_config(ROBOT, overrides).to_dict()
     before["reward_config"]["scales"]["tracking_lin_vel"] = 9.0
@@ -68,7 +70,7 @@ def test_settings_within_settings_can_be_changed(overrides):
         ({"sim_dt.speed": 1}, "sim_dt has no settings in it"),
     ],
 )
-def test_settings_that_there_are_not_are_refused(overrides, message):
+def test_settings_that_there_are_not_are_refused(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         task_config(ROBOT, overrides)
 
@@ -76,13 +78,13 @@ def test_settings_that_there_are_not_are_refused(overrides, message):
 class EndsAtOnce(cartpole.Balance):
     """A task whose episodes end with their first step, which pays 1, as each later one would."""
 
-    def step(self, state, action):
+    def step(self, state: Any, action: Any) -> Any:
         after = super().step(state, action)
         return after.replace(reward=jax.numpy.ones(()), done=jax.numpy.ones(()))
 
 
-def test_a_task_that_ends_within_repeated_actions_stops_there():
-    def make(**kwargs):
+def test_a_task_that_ends_within_repeated_actions_stops_there() -> None:
+    def make(**kwargs: Any) -> Any:
         return EndsAtOnce(swing_up=False, sparse=False, **kwargs)
 
     dm_control_suite.register_environment("EndsAtOnce", make, cartpole.default_config)
@@ -97,8 +99,8 @@ def test_a_task_that_ends_within_repeated_actions_stops_there():
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
-def test_a_file_that_a_users_task_lacks_is_not_blamed_on_the_robots():
-    def make(**kwargs):
+def test_a_file_that_a_users_task_lacks_is_not_blamed_on_the_robots() -> None:
+    def make(**kwargs: Any) -> Any:
         raise FileNotFoundError(2, "No such file", "my_robot.xml")
 
     dm_control_suite.register_environment("NoFile", make, cartpole.default_config)
@@ -107,19 +109,21 @@ def test_a_file_that_a_users_task_lacks_is_not_blamed_on_the_robots():
 
 
 @pytest.mark.skipif(MENAGERIE_PATH.exists(), reason="mujoco_menagerie is there")
-def test_robots_that_cannot_be_fetched_are_named_in_one_sentence(monkeypatch):
+def test_robots_that_cannot_be_fetched_are_named_in_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("PATH", "")  # so that there is no git
     with pytest.raises(gym.error.DependencyNotInstalled, match="needs the robots of mujoco_menag"):
         PlaygroundEnv(ROBOT)
 
 
-def test_every_other_task_is_registered():
+def test_every_other_task_is_registered() -> None:
     assert {f"Playground/{task}-v0" for task in STOCK_TASKS} <= set(gym.registry)
     assert gym.make("Playground/PendulumSwingup-v0").observation_space.shape == (3,)
 
 
-def test_a_task_that_was_added_is_registered_on_request():
-    def make(**kwargs):
+def test_a_task_that_was_added_is_registered_on_request() -> None:
+    def make(**kwargs: Any) -> Any:
         return cartpole.Balance(swing_up=False, sparse=False, **kwargs)
 
     dm_control_suite.register_environment("Added", make, cartpole.default_config)
@@ -131,13 +135,13 @@ def test_a_task_that_was_added_is_registered_on_request():
 class TwoSenses(cartpole.Balance):
     """A task as a user may add it: what it observes is a dictionary."""
 
-    def _get_obs(self, data, info):
+    def _get_obs(self, data: Any, info: Any) -> dict[str, Any]:
         everything = super()._get_obs(data, info)
         return {"state": everything[:3], "velocity": everything[3:]}
 
 
-def test_a_task_of_the_users_own_with_several_observations():
-    def make(**kwargs):
+def test_a_task_of_the_users_own_with_several_observations() -> None:
+    def make(**kwargs: Any) -> Any:
         return TwoSenses(swing_up=False, sparse=False, **kwargs)
 
     dm_control_suite.register_environment("TwoSenses", make, cartpole.default_config)

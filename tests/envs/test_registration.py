@@ -4,6 +4,9 @@ import re
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -16,14 +19,14 @@ from sb3_policyflow.envs.extras import install_command
 TASK = "Playground/CheetahRun-v0"
 
 
-def test_registering_twice_is_silent():
+def test_registering_twice_is_silent() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sb3_policyflow.envs.register()
 
 
 @pytest.mark.slow
-def test_registering_imports_neither_torch_nor_mujoco():
+def test_registering_imports_neither_torch_nor_mujoco() -> None:
     code = """
 import importlib.util, sys, gymnasium
 # The package without what it imports itself.
@@ -38,7 +41,7 @@ assert not {"torch", "mujoco", "matplotlib"} & set(sys.modules)
 
 
 @pytest.mark.slow
-def test_tasks_are_registered_without_the_simulator():
+def test_tasks_are_registered_without_the_simulator() -> None:
     code = """
 import sys, gymnasium as gym, sb3_policyflow
 from sb3_policyflow.envs.task_names import *
@@ -50,11 +53,11 @@ assert not {"jax", "mujoco", "mujoco_playground"} & set(sys.modules)
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_the_paper_has_ten_tasks():
+def test_the_paper_has_ten_tasks() -> None:
     assert len(sb3_policyflow.envs.PLAYGROUND_TASKS) == 10
 
 
-def make_four(env_id):
+def make_four(env_id: str) -> Any:
     return gym.make_vec(env_id, 4)
 
 
@@ -69,20 +72,26 @@ def make_four(env_id):
         (ensure_registered, "PointMaze_Open-v9", "gymnasium_robotics", "robotics"),
     ],
 )
-def test_a_missing_extra_is_named_in_one_sentence(make, env_id, module, extra, monkeypatch):
+def test_a_missing_extra_is_named_in_one_sentence(
+    make: Callable[[str], Any],
+    env_id: str,
+    module: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     sentence = re.escape(f"{env_id} needs {module}: {install_command(extra)}")
     with pytest.raises(DependencyNotInstalled, match=f"^{sentence}$"):
         make(env_id)
 
 
-def test_the_command_is_for_a_checkout():
+def test_the_command_is_for_a_checkout() -> None:
     assert 'pip install ".[robotics]"` in the checkout' in install_command("robotics")
     assert '--upgrade-strategy eager ".[onnx]"`' in install_command("onnx", upgrade=True)
 
 
 @pytest.fixture
-def broken_playground(tmp_path, monkeypatch):
+def broken_playground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A module in place of MuJoCo Playground's, whose source is to be written."""
     monkeypatch.delitem(sys.modules, "mujoco_playground", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
@@ -97,7 +106,7 @@ def broken_playground(tmp_path, monkeypatch):
         "raise ImportError('not_there\\nand how to\\nmend it')",
     ],
 )
-def test_a_broken_package_is_told_from_a_missing_one(fault, broken_playground):
+def test_a_broken_package_is_told_from_a_missing_one(fault: str, broken_playground: Path) -> None:
     broken_playground.write_text(fault)
     with pytest.raises(DependencyNotInstalled) as caught:
         gym.make(TASK)
@@ -108,7 +117,7 @@ def test_a_broken_package_is_told_from_a_missing_one(fault, broken_playground):
     assert "\n" not in message
 
 
-def test_an_old_version_is_named_before_it_is_imported(broken_playground):
+def test_an_old_version_is_named_before_it_is_imported(broken_playground: Path) -> None:
     broken_playground.write_text("import what_it_had_then")
     metadata = broken_playground.parent / "playground-0.0.5.dist-info" / "METADATA"
     metadata.parent.mkdir()
