@@ -19,14 +19,10 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.dppo import DPPO
-from sb3_policyflow.fpo import FPO
-from sb3_policyflow.policyflow import PolicyFlow
 
 Observations = th.Tensor | dict[str, th.Tensor]
-ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO, DPPO)
 
 
 class NormalizeObservation(nn.Module):
@@ -196,7 +192,7 @@ def load_policy(path: str | Path) -> FlowPolicy:
     """
     data, _, _ = load_from_zip_file(path, device="cpu")
     policy_class = (data or {}).get("policy_class", object)
-    for algorithm in ALGORITHMS:
+    for algorithm in ALGORITHMS.values():
         if issubclass(policy_class, algorithm.policy_base):
             return algorithm.load(path, device="cpu").policy
     raise ValueError(
