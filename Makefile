@@ -11,13 +11,17 @@ PLAYGROUND_TESTS := tests/envs/test_playground.py tests/envs/test_playground_tas
 	tests/integrations/rl_zoo3/test_playground_commands.py \
 	tests/integrations/rl_zoo3/test_experiment.py
 
-.PHONY: demo test test-playground lint types docs clean
+.PHONY: demo test test-fast test-playground lint types docs clean
 
 demo: $(VENV)/demo-installed
 	$(BIN)/python -m sb3_policyflow.benchmark demo
 
 test: $(VENV)/tests-installed
 	$(BIN)/python -m pytest --numprocesses 2 $(PYTEST_ARGS)
+
+# A minute, for while one works: every part is touched, and what takes seconds is left out.
+test-fast: $(VENV)/tests-installed
+	$(BIN)/python -m pytest -m "not slow" --numprocesses 2 $(PYTEST_ARGS)
 
 # MuJoCo Playground brings 1.5 GB of simulators, and each of its tasks takes long to compile.
 test-playground: $(VENV)/playground-installed

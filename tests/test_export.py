@@ -17,13 +17,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.export import ActionModule, export, main
+from tests.helpers import TINY, TWO_EPOCHS
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-EACH = pytest.mark.parametrize("algorithm", [PolicyFlow, FPO, DPPO])
-SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 32, "n_epochs": 2}
-NETS = {"net_arch": [16], "embedding_dim": 8, "initialization": "glorot"}
+NETS = {**TINY, "initialization": "glorot"}
 STEPS: dict[type[Any], dict[str, Any]] = {
     PolicyFlow: {"n_flow_steps": 2, "solver": "midpoint"},
     FPO: {"n_flow_steps": 2, "solver": "heun"},
@@ -61,8 +60,8 @@ def images() -> gym.Env[Any, Any]:
 
 
 def trained(algorithm: type[Any], policy: str, env: VecEnv | str, **options: Any) -> Any:
-    options = {**SMALL, **STEPS[algorithm], **options}
-    return algorithm(policy, env, policy_kwargs=NETS, seed=0, **options).learn(64)
+    options = {**TWO_EPOCHS, **STEPS[algorithm], **options}
+    return algorithm(policy, env, policy_kwargs=NETS, **options).learn(64)
 
 
 def raw_and_normalized(env: VecNormalize) -> tuple[Any, Any]:
@@ -79,7 +78,6 @@ def run_onnx(path: Path, observations: Any, **more: np.ndarray) -> np.ndarray:
     return np.asarray(actions)
 
 
-@EACH
 def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 3))
     model = trained(algorithm, "MlpPolicy", env)
@@ -92,7 +90,7 @@ def test_mlp_policy(algorithm: type[Any], tmp_path: Path) -> None:
     assert expected.std() > 0
 
 
-@EACH
+@pytest.mark.slow
 def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     model = trained(algorithm, "CnnPolicy", make_vec_env(images, 2))
     export(model.policy, tmp_path / "policy.onnx")
@@ -101,7 +99,7 @@ def test_cnn_policy(algorithm: type[Any], tmp_path: Path) -> None:
     np.testing.assert_allclose(run_onnx(tmp_path / "policy.onnx", pictures), expected, atol=1e-5)
 
 
-@EACH
+@pytest.mark.slow
 def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env(Robot, 3), norm_obs_keys=["joints"])
     model = trained(algorithm, "MultiInputPolicy", env)
@@ -115,6 +113,7 @@ def test_dict_policy(algorithm: type[Any], tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "options"),
     [
@@ -173,6 +172,7 @@ np.save("actions.npy", actions)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "kind"), [(PolicyFlow, "onnx"), (DPPO, "pt2")])
 def test_command_line_writes_files_that_load_without_this_package(
     algorithm: type[Any], kind: str, tmp_path: Path

@@ -3,9 +3,12 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parent / "scripts" / "fuzz.py"
 
 
+@pytest.mark.slow
 def test_every_draw_trains_or_is_refused_by_a_sentence() -> None:
     spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
     assert spec is not None

@@ -28,33 +28,26 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1, "seed": 0}
-TINY = {"net_arch": [8], "embedding_dim": 8}
+from tests.helpers import SMALL, TINY, weights
 
 
-def make(model_class: type[Any], env: Any, policy: str = "MlpPolicy", **options: Any) -> Any:
-    return model_class(policy, env, **{**SMALL, "policy_kwargs": TINY, **options})
-
-
-def weights(model: Any) -> th.Tensor:
-    return th.cat(
-        [value.detach().flatten().float() for value in model.policy.state_dict().values()]
-    )
+def make(algorithm: type[Any], env: Any, policy: str = "MlpPolicy", **options: Any) -> Any:
+    return algorithm(policy, env, **{**SMALL, "policy_kwargs": TINY, **options})
 
 
 # Images, stacks and normalized parts
 
 
-def test_vec_framestack_of_images(model_class: type[Any], tmp_path: Path) -> None:
+def test_vec_framestack_of_images(algorithm: type[Any], tmp_path: Path) -> None:
     def frames() -> Any:
         screens = FakeImageEnv(screen_height=40, screen_width=40, n_channels=1, discrete=False)
         return VecFrameStack(DummyVecEnv([lambda: screens]), n_stack=4)
 
     kwargs = {**TINY, "features_extractor_kwargs": {"features_dim": 8}}
-    model = make(model_class, frames(), "CnnPolicy", policy_kwargs=kwargs).learn(16)
+    model = make(algorithm, frames(), "CnnPolicy", policy_kwargs=kwargs).learn(16)
     assert model.observation_space.shape == (4, 40, 40)
     model.save(tmp_path / "model")
-    loaded = model_class.load(tmp_path / "model", env=frames())
+    loaded = algorithm.load(tmp_path / "model", env=frames())
     # As the environment gives them, with their channels last, or already turned.
     stack = frames().reset()
     turned = stack.transpose(0, 3, 1, 2)
@@ -77,21 +70,21 @@ class Screen(gym.Env[Any, Any]):
         return self.observation_space.sample(), 0.0, False, False, {}
 
 
-def test_image_like_input(model_class: type[Any]) -> None:
+def test_image_like_input(algorithm: type[Any]) -> None:
     extractor = {"features_dim": 8, "normalized_image": True}
     kwargs = {**TINY, "normalize_images": False, "features_extractor_kwargs": extractor}
-    model = make(model_class, Screen(), "CnnPolicy", policy_kwargs=kwargs).learn(16)
+    model = make(algorithm, Screen(), "CnnPolicy", policy_kwargs=kwargs).learn(16)
     assert model.predict(Screen.observation_space.sample())[0].shape == (1,)
     with pytest.raises(AssertionError, match="NatureCNN"):
-        make(model_class, Screen(), "CnnPolicy")
+        make(algorithm, Screen(), "CnnPolicy")
 
 
-def test_normalize_dict_selected_keys(model_class: type[Any]) -> None:
+def test_normalize_dict_selected_keys(algorithm: type[Any]) -> None:
     env: Any = VecNormalize(
         DummyVecEnv([lambda: SimpleMultiObsEnv(discrete_actions=False)]), norm_obs_keys=["vec"]
     )
     kwargs = {**TINY, "features_extractor_kwargs": {"cnn_output_dim": 4}}
-    model = make(model_class, env, "MultiInputPolicy", policy_kwargs=kwargs).learn(32)
+    model = make(algorithm, env, "MultiInputPolicy", policy_kwargs=kwargs).learn(32)
     stored = model.rollout_buffer.observations
     assert stored["vec"].min() < -0.5 < 0.0 <= env.get_original_obs()["vec"].min()
     np.testing.assert_array_equal(stored["img"], stored["img"].astype(np.uint8))
@@ -130,10 +123,10 @@ class Rollout(BaseCallback):
 
 @pytest.mark.parametrize("gae_lambda", [1.0, 0.9])
 @pytest.mark.parametrize("gamma", [1.0, 0.99])
-def test_env(model_class: type[Any], gae_lambda: float, gamma: float) -> None:
+def test_env(algorithm: type[Any], gae_lambda: float, gamma: float) -> None:
     """Advantages are the sum of discounted errors to the end of the episode."""
     rollout = Rollout()
-    model = make(model_class, Rewards(), gamma=gamma, gae_lambda=gae_lambda, n_steps=15)
+    model = make(algorithm, Rewards(), gamma=gamma, gae_lambda=gae_lambda, n_steps=15)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # 15 is no multiple of the batch size
         model.learn(15, rollout)
@@ -151,25 +144,25 @@ def test_env(model_class: type[Any], gae_lambda: float, gamma: float) -> None:
     np.testing.assert_array_equal(np.flatnonzero(rollout.arrays["episode_starts"]), [0, 5, 10])
 
 
-def test_vec_check_nan(model_class: type[Any]) -> None:
+def test_vec_check_nan(algorithm: type[Any]) -> None:
     """SB3's own detector can stay around the environment."""
     env = VecCheckNan(DummyVecEnv([Rewards]), raise_exception=True)
-    assert make(model_class, env).learn(16).num_timesteps == 16
+    assert make(algorithm, env).learn(16).num_timesteps == 16
 
 
 # Episodes and their ends
 
 
 @pytest.mark.parametrize("stats_window_size", [1, 42])
-def test_ep_buffers_stats_window_size(model_class: type[Any], stats_window_size: int) -> None:
-    model = make(model_class, Rewards(), stats_window_size=stats_window_size).learn(32)
+def test_ep_buffers_stats_window_size(algorithm: type[Any], stats_window_size: int) -> None:
+    model = make(algorithm, Rewards(), stats_window_size=stats_window_size).learn(32)
     assert model.ep_info_buffer.maxlen == stats_window_size
     assert model.ep_success_buffer.maxlen == stats_window_size
     assert len(model.ep_info_buffer) == min(stats_window_size, 32 // 5)
 
 
-def test_callbacks_that_stop(model_class: type[Any]) -> None:
-    model = make(model_class, Rewards()).learn(1000, StopTrainingOnMaxEpisodes(max_episodes=3))
+def test_callbacks_that_stop(algorithm: type[Any]) -> None:
+    model = make(algorithm, Rewards()).learn(1000, StopTrainingOnMaxEpisodes(max_episodes=3))
     assert model.num_timesteps == 15
     patience = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1, min_evals=1)
     evaluation = EvalCallback(
@@ -179,22 +172,22 @@ def test_callbacks_that_stop(model_class: type[Any]) -> None:
     assert model.learn(1000, evaluation).num_timesteps == 30
 
 
-def test_progress_bar(model_class: type[Any]) -> None:
+def test_progress_bar(algorithm: type[Any]) -> None:
     pytest.importorskip("rich")
     pytest.importorskip("tqdm")
-    assert make(model_class, Rewards()).learn(16, progress_bar=True).num_timesteps == 16
+    assert make(algorithm, Rewards()).learn(16, progress_bar=True).num_timesteps == 16
 
 
 # Policies
 
 
-def test_custom_policy(model_class: type[Any], tmp_path: Path) -> None:
+def test_custom_policy(algorithm: type[Any], tmp_path: Path) -> None:
     """A policy of one's own is given as a class, saved and loaded."""
-    base = model_class.policy_aliases["MlpPolicy"]
+    base = algorithm.policy_aliases["MlpPolicy"]
     policy_class = type("OwnPolicy", (base,), {"scale": 0.5, "sample_actions": _halved(base)})
-    model = make(model_class, IdentityEnvBox(-10, 10), policy_class).learn(16)
+    model = make(algorithm, IdentityEnvBox(-10, 10), policy_class).learn(16)
     model.save(tmp_path / "model")
-    loaded = model_class.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert type(loaded.policy).__name__ == "OwnPolicy"
     assert th.equal(weights(model), weights(loaded))
     observation = model.observation_space.sample()
@@ -210,25 +203,25 @@ def _halved(base: type[Any]) -> Any:
     return sample_actions
 
 
-def test_mixing_gym_vecenv_api(model_class: type[Any]) -> None:
+def test_mixing_gym_vecenv_api(algorithm: type[Any]) -> None:
     env = gym.make("Pendulum-v1")
     with pytest.raises(ValueError, match="mixing Gym API with SB3 VecEnv API"):
-        make(model_class, env).predict(env.reset())
+        make(algorithm, env).predict(env.reset())
 
 
-def test_no_warnings_from_construction_to_loading(model_class: type[Any], tmp_path: Path) -> None:
+def test_no_warnings_from_construction_to_loading(algorithm: type[Any], tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = VecNormalize(make_vec_env("Pendulum-v1", 2))
-        model = make(model_class, env, desired_kl=0.01, clip_range_vf=0.2).learn(64)
+        model = make(algorithm, env, desired_kl=0.01, clip_range_vf=0.2).learn(64)
         model.save(tmp_path / "model")
-        loaded = model_class.load(tmp_path / "model", env=env)
+        loaded = algorithm.load(tmp_path / "model", env=env)
         loaded.learn(32, reset_num_timesteps=False)
 
 
 def test_print_system_info(
-    model_class: type[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    algorithm: type[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make(model_class, Rewards()).save(tmp_path / "model")
-    model_class.load(tmp_path / "model", print_system_info=True)
+    make(algorithm, Rewards()).save(tmp_path / "model")
+    algorithm.load(tmp_path / "model", print_system_info=True)
     assert "Stable-Baselines3" in capsys.readouterr().out

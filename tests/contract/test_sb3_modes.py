@@ -10,7 +10,7 @@ from stable_baselines3.common.envs import IdentityEnvBox
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
+from tests.helpers import SMALL, TINY, collect
 
 
 class BatchNormDropoutExtractor(BaseFeaturesExtractor):
@@ -27,10 +27,10 @@ class BatchNormDropoutExtractor(BaseFeaturesExtractor):
         return features
 
 
-def with_modes(model_class: type[Any], **options: Any) -> Any:
-    kwargs = {"features_extractor_class": BatchNormDropoutExtractor, "net_arch": [8]}
-    return model_class(
-        "MlpPolicy", IdentityEnvBox(-10, 10), policy_kwargs=kwargs, seed=1, **SMALL, **options
+def with_modes(algorithm: type[Any], **options: Any) -> Any:
+    kwargs = {"features_extractor_class": BatchNormDropoutExtractor}
+    return algorithm(
+        "MlpPolicy", IdentityEnvBox(-10, 10), policy_kwargs={**TINY, **kwargs}, **SMALL, **options
     )
 
 
@@ -39,27 +39,26 @@ def statistics(model: Any) -> list[th.Tensor]:
     return [norm.running_mean.clone(), norm.running_var.clone()]
 
 
-def test_a2c_ppo_train_with_batch_norm(model_class: type[Any]) -> None:
-    model = with_modes(model_class)
+def test_a2c_ppo_train_with_batch_norm(algorithm: type[Any]) -> None:
+    model = with_modes(algorithm)
     before = statistics(model)
     model.learn(32)
     assert not any(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
 
 
-def test_a2c_ppo_collect_rollouts_with_batch_norm(model_class: type[Any]) -> None:
-    """Acting changes no statistics, nor does learning that has no step to make."""
-    model = with_modes(model_class)
+def test_a2c_ppo_collect_rollouts_with_batch_norm(algorithm: type[Any]) -> None:
+    """Acting changes no statistics, and an update changes them once in each minibatch."""
+    model = with_modes(algorithm)
     before = statistics(model)
-    _, callback = model._setup_learn(16)
     for _ in range(3):
-        model.collect_rollouts(model.env, callback, model.rollout_buffer, 16)
+        collect(model)
     assert all(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
-    model._behavior(model._rollout())
-    assert all(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
+    model.train()
+    assert model.policy.features_extractor.norm.num_batches_tracked.item() == 16 // 8
 
 
-def test_predict_with_dropout_batch_norm(model_class: type[Any]) -> None:
-    model = with_modes(model_class).learn(32)
+def test_predict_with_dropout_batch_norm(algorithm: type[Any]) -> None:
+    model = with_modes(algorithm).learn(32)
     before = statistics(model)
     obs = np.stack([model.observation_space.sample() for _ in range(4)])
     first, second = (model.predict(obs, deterministic=True)[0] for _ in range(2))
@@ -67,8 +66,8 @@ def test_predict_with_dropout_batch_norm(model_class: type[Any]) -> None:
     assert all(th.equal(one, two) for one, two in zip(before, statistics(model), strict=True))
 
 
-def test_set_training_mode(model_class: type[Any]) -> None:
-    policy = with_modes(model_class).policy
+def test_set_training_mode(algorithm: type[Any]) -> None:
+    policy = with_modes(algorithm).policy
     for mode in (True, False, True):
         policy.set_training_mode(mode)
         assert all(module.training is mode for module in policy.modules())
@@ -76,11 +75,11 @@ def test_set_training_mode(model_class: type[Any]) -> None:
     assert not policy.training
 
 
-def test_statistics_are_saved(model_class: type[Any], tmp_path: Path) -> None:
-    model = with_modes(model_class).learn(32)
+def test_statistics_are_saved(algorithm: type[Any], tmp_path: Path) -> None:
+    model = with_modes(algorithm).learn(32)
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
-    loaded = model_class.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert all(map(th.equal, statistics(model), statistics(loaded)))
     policy = type(model.policy).load(tmp_path / "policy")
     observations = np.stack([model.observation_space.sample() for _ in range(4)])

@@ -22,9 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_policyflow import PolicyFlow
-
-SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
-TINY = {"net_arch": [8]}
+from tests.helpers import SMALL, TINY, train, weights
 
 
 class DummyEnv(gym.Env[Any, Any]):
@@ -43,10 +41,6 @@ class DummyEnv(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         assert self.action_space.contains(np.asarray(action, dtype=self.action_space.dtype))
         return self.observation_space.sample(), 0.0, False, bool(np.random.rand() < 0.1), {}
-
-
-def weights(model: Any) -> th.Tensor:
-    return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
 
 
 # Spaces
@@ -69,13 +63,14 @@ def weights(model: Any) -> th.Tensor:
     ],
     ids=str,
 )
-def test_identity_spaces(model_class: type[Any], space: spaces.Space[Any]) -> None:
+def test_identity_spaces(algorithm: type[Any], space: spaces.Space[Any]) -> None:
     """Observations of every kind."""
     env = DummyEnv(space)
     check_env(env, warn=False)
-    model = model_class("MlpPolicy", env, policy_kwargs=TINY, **SMALL).learn(32)
+    model = algorithm("MlpPolicy", env, policy_kwargs=TINY, **SMALL).learn(32)
     assert th.isfinite(weights(model)).all()
-    evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)
+    mean, _ = evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)
+    assert mean == 0.0
 
 
 @pytest.mark.parametrize(
@@ -90,8 +85,8 @@ def test_identity_spaces(model_class: type[Any], space: spaces.Space[Any]) -> No
     ],
     ids=str,
 )
-def test_action_spaces(model_class: type[Any], space: spaces.Space[Any]) -> None:
-    model = model_class("MlpPolicy", DummyEnv(None, space), policy_kwargs=TINY, **SMALL).learn(32)
+def test_action_spaces(algorithm: type[Any], space: spaces.Space[Any]) -> None:
+    model = algorithm("MlpPolicy", DummyEnv(None, space), policy_kwargs=TINY, **SMALL).learn(32)
     with th.no_grad():
         model.policy.velocity.output.bias.fill_(-100.0 if model.policy.squash_output else 100.0)
     for deterministic in (True, False):
@@ -101,27 +96,27 @@ def test_action_spaces(model_class: type[Any], space: spaces.Space[Any]) -> None
 
 
 @pytest.mark.parametrize("bounds", [(-np.inf, np.inf), (0, np.inf), (-np.inf, 0)])
-def test_unbounded_actions_are_refused(model_class: type[Any], bounds: tuple[float, float]) -> None:
+def test_unbounded_actions_are_refused(algorithm: type[Any], bounds: tuple[float, float]) -> None:
     """As by PPO: SB3 wants bounds to clip to, and says so."""
     with pytest.raises(AssertionError, match="must have a finite lower and upper bound"):
-        model_class("MlpPolicy", DummyEnv(None, spaces.Box(*bounds, (2,))))
+        algorithm("MlpPolicy", DummyEnv(None, spaces.Box(*bounds, (2,))))
 
 
 @pytest.mark.parametrize(
     "space", [spaces.Discrete(3, start=1), spaces.MultiDiscrete([2], start=[1])]
 )
 def test_discrete_spaces_that_do_not_count_from_0(
-    model_class: type[Any], space: spaces.Space[Any]
+    algorithm: type[Any], space: spaces.Space[Any]
 ) -> None:
     for policy, observations in (("MlpPolicy", space), ("MultiInputPolicy", {"a": space})):
         whole = spaces.Dict(observations) if isinstance(observations, dict) else observations
         with pytest.raises(ValueError, match="must count from 0, as SB3 encodes them"):
-            model_class(policy, DummyEnv(whole))
+            algorithm(policy, DummyEnv(whole))
 
 
-def test_float64_action_space(model_class: type[Any]) -> None:
+def test_float64_action_space(algorithm: type[Any]) -> None:
     env = DummyEnv(spaces.Box(-1, 1, (1,), np.float64), spaces.Box(-1, 1, (1,), np.float64))
-    model = model_class("MlpPolicy", env, policy_kwargs=TINY, **SMALL).learn(16)
+    model = algorithm("MlpPolicy", env, policy_kwargs=TINY, **SMALL).learn(16)
     action, _ = model.predict(env.observation_space.sample(), deterministic=True)
     assert action.dtype == np.float64 or env.action_space.contains(action.astype(np.float64))
 
@@ -130,7 +125,7 @@ def test_float64_action_space(model_class: type[Any]) -> None:
 
 
 @pytest.mark.parametrize("channel_last", [False, True])
-def test_dict_spaces(model_class: type[Any], channel_last: bool) -> None:
+def test_dict_spaces(algorithm: type[Any], channel_last: bool) -> None:
     shape = (36, 36, 3) if channel_last else (3, 36, 36)
     parts: dict[str, spaces.Space[Any]] = {
         "img": spaces.Box(0, 255, shape, np.uint8),
@@ -138,14 +133,14 @@ def test_dict_spaces(model_class: type[Any], channel_last: bool) -> None:
         "discrete": spaces.Discrete(4),
     }
     space = spaces.Dict(parts)
-    kwargs = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 4}}
+    kwargs = {**TINY, "features_extractor_kwargs": {"cnn_output_dim": 4}}
     env = make_vec_env(lambda: DummyEnv(space), 2)
-    model = model_class("MultiInputPolicy", env, policy_kwargs=kwargs, **SMALL).learn(32)
+    model = algorithm("MultiInputPolicy", env, policy_kwargs=kwargs, **SMALL).learn(32)
     evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)
     assert model.predict(space.sample())[0].shape == (2,)
 
 
-def test_consistency(model_class: type[Any]) -> None:
+def test_consistency(algorithm: type[Any]) -> None:
     """The same numbers, in a dictionary or not, train the same weights."""
 
     class AsDict(gym.ObservationWrapper[Any, Any, Any]):
@@ -158,7 +153,7 @@ def test_consistency(model_class: type[Any]) -> None:
 
     def train(policy: str, wrap: Any) -> th.Tensor:
         env = make_vec_env("Pendulum-v1", seed=0, wrapper_class=wrap)
-        model = model_class(policy, env, policy_kwargs=TINY, seed=1, **SMALL)
+        model = algorithm(policy, env, policy_kwargs=TINY, **SMALL)
         return weights(model.learn(48))
 
     assert th.equal(train("MlpPolicy", None), train("MultiInputPolicy", AsDict))
@@ -170,13 +165,18 @@ def test_dict_nested() -> None:
         PolicyFlow("MultiInputPolicy", DummyEnv(nested))
 
 
-def test_dict_vec_framestack(model_class: type[Any]) -> None:
+def test_dict_vec_framestack(algorithm: type[Any]) -> None:
     env: Any = DummyVecEnv([lambda: SimpleMultiObsEnv(random_start=True, discrete_actions=False)])
     order: Any = {"vec": None, "img": "last"}
     env = VecFrameStack(env, n_stack=3, channels_order=order)
-    kwargs = {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 4}}
-    model = model_class("MultiInputPolicy", env, policy_kwargs=kwargs, **SMALL).learn(32)
-    evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)
+    kwargs = {**TINY, "features_extractor_kwargs": {"cnn_output_dim": 4}}
+    model = train(algorithm("MultiInputPolicy", env, policy_kwargs=kwargs, **SMALL), 32)
+    observation = model.get_env().reset()
+    assert observation["vec"].shape == (1, 3 * 5)
+    assert observation["img"].shape == (1, 3, 64, 64)
+    actions, _ = model.predict(observation)
+    assert actions.shape == (1, *env.action_space.shape)
+    assert np.isfinite(evaluate_policy(model, model.get_env(), n_eval_episodes=1, warn=False)[0])
 
 
 def test_multiprocessing() -> None:
@@ -184,7 +184,7 @@ def test_multiprocessing() -> None:
         return SimpleMultiObsEnv(discrete_actions=False)
 
     env = make_vec_env(make, 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs={"start_method": "fork"})
-    PolicyFlow("MultiInputPolicy", env, policy_kwargs=TINY, **SMALL).learn(32)
+    train(PolicyFlow("MultiInputPolicy", env, policy_kwargs=TINY, **SMALL), 32)
     env.close()
 
 
@@ -192,7 +192,7 @@ def test_vec_transpose_skip() -> None:
     """Images with their channels first are left as they are, those with channels last turned."""
     for shape, turned in (((3, 40, 40), False), ((40, 40, 3), True)):
         space = spaces.Box(0, 255, shape, np.uint8)
-        kwargs = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8}}
+        kwargs = {**TINY, "features_extractor_kwargs": {"features_dim": 8}}
         model = PolicyFlow("CnnPolicy", DummyEnv(space), policy_kwargs=kwargs, **SMALL).learn(16)
         assert isinstance(model.get_env(), VecTransposeImage) is turned
         assert model.predict(space.sample())[0].shape == (2,)
@@ -211,17 +211,26 @@ def test_image_space_checks() -> None:
     [[], [4], [4, 4], {"vf": [16], "pi": [8]}, {"vf": [8, 4], "pi": [8]}, {"vf": [8]}, {"pi": [8]}],
     ids=str,
 )
-def test_flexible_mlp(model_class: type[Any], net_arch: Any) -> None:
-    model_class("MlpPolicy", DummyEnv(), policy_kwargs={"net_arch": net_arch}, **SMALL).learn(16)
+def test_flexible_mlp(algorithm: type[Any], net_arch: Any) -> None:
+    """The layers are those that were asked for, and they learn."""
+    model = algorithm("MlpPolicy", DummyEnv(), policy_kwargs={"net_arch": net_arch}, **SMALL)
+    train(model, 16)
+    sizes = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+    for key, layers in (
+        ("pi", model.policy.velocity.hidden),
+        ("vf", model.policy.mlp_extractor.value_net),
+    ):
+        found = [layer.out_features for layer in layers if isinstance(layer, th.nn.Linear)]
+        assert found == sizes.get(key, [])
 
 
 @pytest.mark.parametrize(
     "optimizer", [(th.optim.AdamW, {"weight_decay": 0.01}), (RMSpropTFLike, {"eps": 1e-5})]
 )
-def test_custom_optimizer(model_class: type[Any], optimizer: tuple[Any, dict[str, Any]]) -> None:
+def test_custom_optimizer(algorithm: type[Any], optimizer: tuple[Any, dict[str, Any]]) -> None:
     kind, options = optimizer
-    kwargs = {"optimizer_class": kind, "optimizer_kwargs": options, "net_arch": [8]}
-    model = model_class("MlpPolicy", DummyEnv(), policy_kwargs=kwargs, **SMALL).learn(16)
+    kwargs = {"optimizer_class": kind, "optimizer_kwargs": options, **TINY}
+    model = algorithm("MlpPolicy", DummyEnv(), policy_kwargs=kwargs, **SMALL).learn(16)
     assert isinstance(model.policy.optimizer, kind)
     for name, value in options.items():
         assert model.policy.optimizer.param_groups[0][name] == value
@@ -230,34 +239,34 @@ def test_custom_optimizer(model_class: type[Any], optimizer: tuple[Any, dict[str
 # Constructing and repeating
 
 
-def test_no_warnings_on_construction(model_class: type[Any]) -> None:
+def test_no_warnings_on_construction(algorithm: type[Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model_class("MlpPolicy", "Pendulum-v1")
-        model_class("MlpFlowPolicy", make_vec_env("Pendulum-v1", 4), n_steps=16, device="cpu")
+        algorithm("MlpPolicy", "Pendulum-v1")
+        algorithm("MlpFlowPolicy", make_vec_env("Pendulum-v1", 4), n_steps=16, device="cpu")
 
 
-def test_deterministic_training_common(model_class: type[Any]) -> None:
+def test_deterministic_training_common(algorithm: type[Any]) -> None:
     results = []
     for _ in range(2):
         env = IdentityEnvBox(-10, 10)
-        model = model_class("MlpPolicy", env, policy_kwargs=TINY, seed=0, **SMALL).learn(64)
+        model = algorithm("MlpPolicy", env, policy_kwargs=TINY, **SMALL).learn(64)
         rewards = evaluate_policy(model, model.get_env(), 3, deterministic=False, warn=False)
         results.append((weights(model), rewards))
     assert th.equal(results[0][0], results[1][0])
     assert results[0][1] == results[1][1]
 
 
-def test_auto_wrap(model_class: type[Any]) -> None:
+def test_auto_wrap(algorithm: type[Any]) -> None:
     with pytest.raises(ValueError, match="needs an environment to know its spaces"):
-        model_class("MlpPolicy", None)
-    assert isinstance(model_class("MlpPolicy", "Pendulum-v1").get_env(), DummyVecEnv)
+        algorithm("MlpPolicy", None)
+    assert isinstance(algorithm("MlpPolicy", "Pendulum-v1").get_env(), DummyVecEnv)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_predict(model_class: type[Any], n_envs: int) -> None:
+def test_predict(algorithm: type[Any], n_envs: int) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs))
-    model = model_class("MlpPolicy", env, policy_kwargs=TINY, **SMALL)
+    model = algorithm("MlpPolicy", env, policy_kwargs=TINY, **SMALL)
     obs: Any = env.reset()
     actions, _ = model.predict(obs)
     assert actions.shape == (n_envs, 1)

@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_policyflow import PolicyFlow
+from tests.helpers import collect, train, weights
 
 
 class Clock(gym.Env[Any, Any]):
@@ -23,19 +24,19 @@ class Clock(gym.Env[Any, Any]):
         self.action_space = spaces.Box(-1, 1, (1,))
         self.limit, self.ends = limit, ends
 
-    def _obs(self) -> Any:
+    def observation(self) -> Any:
         obs = np.array([self.time], dtype=np.float32)
         return {"time": obs} if self.as_dict else obs
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.time = 0
-        return self._obs(), {}
+        return self.observation(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.time += 1
         over = self.time >= self.limit
-        return self._obs(), 1.0, over and self.ends, over and not self.ends, {}
+        return self.observation(), 1.0, over and self.ends, over and not self.ends, {}
 
 
 def clocks(as_dict: bool = False) -> DummyVecEnv:
@@ -45,11 +46,10 @@ def clocks(as_dict: bool = False) -> DummyVecEnv:
     )
 
 
-def collect(env: VecEnv, **options: Any) -> PolicyFlow:
+def collected(env: VecEnv, **options: Any) -> PolicyFlow:
     policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
     model = PolicyFlow(policy, env, n_steps=8, batch_size=24, seed=0, **options)
-    _, callback = model._setup_learn(24)
-    assert model.collect_rollouts(model.env, callback, model.rollout_buffer, 8)  # type: ignore[arg-type]
+    collect(model)
     return model
 
 
@@ -64,7 +64,7 @@ def value(model: PolicyFlow, time: float) -> float:
 @pytest.mark.parametrize("as_dict", [False, True])
 @pytest.mark.parametrize("scheme", ["terminal", "current", "none"])
 def test_time_limits_are_bootstrapped_and_terminations_are_not(scheme: str, as_dict: bool) -> None:
-    model = collect(clocks(as_dict), timeout_bootstrap=scheme)
+    model = collected(clocks(as_dict), timeout_bootstrap=scheme)
     expected = np.ones((8, 3))
     for env, limit in [(0, 3), (1, 4)]:
         seen = {"terminal": limit, "current": limit - 1}.get(scheme)
@@ -74,9 +74,9 @@ def test_time_limits_are_bootstrapped_and_terminations_are_not(scheme: str, as_d
 
 
 def test_same_rewards_as_sb3s_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours = collect(clocks())
+    ours = collected(clocks())
     monkeypatch.setattr(PolicyFlow, "_update_info_buffer", sb3s_update)
-    theirs = collect(clocks())
+    theirs = collected(clocks())
     np.testing.assert_allclose(ours.rollout_buffer.rewards, theirs.rollout_buffer.rewards, 1e-6)
     assert ours.rollout_buffer.rewards.std() > 0
 
@@ -90,7 +90,8 @@ def sb3s_update(self: PolicyFlow, infos: Any, dones: Any = None) -> None:
 
 def test_worker_processes_and_normalized_rewards() -> None:
     env = VecNormalize(SubprocVecEnv([Clock, Clock], start_method="fork"))
-    model = PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=16, seed=0).learn(16)
+    model = PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=16, seed=0)
+    train(model, 16)
     assert np.isfinite(model.rollout_buffer.returns).all()
     env.close()
 
@@ -135,8 +136,7 @@ class Broken(Clock):
 def test_numbers_that_are_not_finite_stop_training(what: str, number: float) -> None:
     env = DummyVecEnv([Clock, lambda: Broken(what, number)])
     model = PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=16)
-    before = [parameter.clone() for parameter in model.policy.parameters()]
+    before = weights(model)
     with pytest.raises(FloatingPointError, match=rf"{what} .* timestep 10, in environment 1"):
         model.learn(100)
-    for old, new in zip(before, model.policy.parameters(), strict=True):
-        assert th.equal(old, new)
+    assert th.equal(weights(model), before)

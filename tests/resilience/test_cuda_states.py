@@ -1,15 +1,22 @@
-"""The random state of the GPU travels with the model, where there is one."""
+"""The random state of the GPU travels with the model, where there is one; runs resume on it."""
 
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import PolicyFlow
+from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 from sb3_policyflow.resilience.saving import RandomStates, random_states_kept
+from tests.helpers import SMALL, TINY, train, weights
 
-SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "seed": 0}
+needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="no GPU that torch can use")
 CUDA = th.device("cuda", 1)
 
 
@@ -54,17 +61,68 @@ def test_a_file_from_the_gpu_loads_without_one(generator: Generator) -> None:
     assert generator.drawn["cuda:1"] == 9
 
 
-@pytest.mark.skipif(not th.cuda.is_available(), reason="no GPU that torch can use")
-def test_runs_on_a_gpu_go_on_as_they_would_have(tmp_path: Path) -> None:
-    model = PolicyFlow("MlpPolicy", "Pendulum-v1", device="cuda", **SMALL).learn(32)
+class Course(gym.Env[Any, Any]):
+    """Sixteen steps that differ from episode to episode by their actions alone."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def observation(self) -> np.ndarray:
+        return np.array([np.cos(self.time), self.position], dtype=np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.time, self.position = 0, 0.0
+        return self.observation(), {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.time += 1
+        self.position += 0.1 * float(action[0])
+        reward = -((self.position - 0.5) ** 2)
+        return self.observation(), reward, self.time == 16, False, {}
+
+
+class DrawsFirst(BaseCallback):
+    """Draws as training is about to begin, and leaves the generator as it was."""
+
+    def _on_training_start(self) -> None:
+        device = self.model.device
+        with random_states_kept(device):
+            self.drawn = th.randn(4, device=device)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@needs_gpu
+def test_learning_and_not_loading_puts_the_generator_back(tmp_path: Path) -> None:
+    env = DummyVecEnv([Course])
+    model = PolicyFlow("MlpPolicy", env, device="cuda", policy_kwargs=TINY, **SMALL).learn(32)
     model.save(tmp_path / "model")
     expected = th.randn(4, device="cuda")
     th.randn(7, device="cuda")
-    PolicyFlow.load(tmp_path / "model", device="cuda")
-    assert th.equal(th.randn(4, device="cuda"), expected)
-    runs = []
+    before = th.cuda.get_rng_state(model.device)
+    loaded = PolicyFlow.load(tmp_path / "model", env=env, device="cuda")
+    loaded.predict(model.observation_space.sample(), deterministic=True)
+    assert th.equal(th.cuda.get_rng_state(model.device), before)
+    callback = DrawsFirst()
+    loaded.learn(16, callback, reset_num_timesteps=False)
+    assert th.equal(callback.drawn, expected)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_gpu)])
+def test_resumed_runs_equal_the_uninterrupted_one(
+    algorithm: type[Any], device: str, tmp_path: Path
+) -> None:
+    """Bit for bit: each rollout begins with an episode, and nothing but the model goes on."""
+    env = DummyVecEnv([Course, Course])
+    options: dict[str, Any] = {**SMALL, "ent_coef": 0.01, "desired_kl": 0.01}
+    model = algorithm("MlpPolicy", env, device=device, policy_kwargs=TINY, **options)
+    checkpoint = RolloutCheckpointCallback(32, str(tmp_path), name_prefix="model")
+    model.learn(4 * 32, checkpoint)
     for _ in range(2):
-        loaded = PolicyFlow.load(tmp_path / "model", env=model.get_env(), device="cuda")
-        loaded.learn(64, reset_num_timesteps=False)
-        runs.append(th.cat([parameter.flatten() for parameter in loaded.policy.parameters()]))
-    assert th.equal(*runs)
+        th.randn(3, device=device)
+        loaded = algorithm.load(tmp_path / "model_64_steps", env=env, device=device)
+        train(loaded, loaded.remaining_timesteps, reset_num_timesteps=False)
+        assert loaded.num_timesteps == 4 * 32
+        assert th.equal(weights(loaded), weights(model))

@@ -22,9 +22,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.resilience.files import written_whole
 from sb3_policyflow.resilience.saving import RandomStates, random_states_kept
+from tests.helpers import SMALL, last_observations, train, weights
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
-SMALL: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "seed": 0}
 
 
 def run_script(*arguments: object) -> str:
@@ -49,6 +49,7 @@ def draws() -> list[float]:
 # Exact resume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["PolicyFlow", "FPO", "DPPO"])
 def test_resumed_runs_equal_each_other_and_the_uninterrupted_one(
     algorithm: str, tmp_path: Path
@@ -122,7 +123,7 @@ def test_a_model_without_a_seed_is_repeatable_too(tmp_path: Path) -> None:
         th.rand(3)
         model = PolicyFlow.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", seed=1))
         model.learn(64, reset_num_timesteps=False)
-        runs.append(th.cat([parameter.flatten() for parameter in model.policy.parameters()]))
+        runs.append(weights(model))
     assert th.equal(*runs)
 
 
@@ -139,27 +140,32 @@ def test_going_on_in_the_middle_of_episodes(tmp_path: Path) -> None:
     model = PolicyFlow("MlpPolicy", env, **SMALL).learn(64)
     model.save(tmp_path / "model")
     assert env.returns.any()
-    last_obs, returns = model._last_obs, env.returns.copy()
+    observations, returns = last_observations(model), env.returns.copy()
     env.returns[:] = 0.0
     fresh = PolicyFlow.load(tmp_path / "model", env=env)
-    assert fresh._last_obs is None
+    assert last_observations(fresh) is None
     assert not env.returns.any()
     loaded = PolicyFlow.load(tmp_path / "model", env=env, force_reset=False)
-    np.testing.assert_array_equal(loaded._last_obs, last_obs)
+    np.testing.assert_array_equal(last_observations(loaded), observations)
     np.testing.assert_array_equal(env.returns, returns)
     with pytest.raises(ValueError, match=r"saved with 2 environments and cannot go on .* with 3"):
         PolicyFlow.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 3), force_reset=False)
 
 
 def test_remaining_timesteps(tmp_path: Path) -> None:
-    model = small_model().learn(64)
-    assert model.remaining_timesteps == 0
-    model._total_timesteps = 160
+    class Interrupted(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.num_timesteps < 64
+
+    model = small_model(learning_rate=lambda progress: 1e-3 * progress)
+    model.learn(160, Interrupted())
+    assert (model.num_timesteps, model.remaining_timesteps) == (64, 160 - 64)
     model.save(tmp_path / "model")
     loaded = PolicyFlow.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"))
-    loaded.learn(loaded.remaining_timesteps, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 160
-    assert loaded._current_progress_remaining == 0.0
+    train(loaded, loaded.remaining_timesteps, reset_num_timesteps=False)
+    assert (loaded.num_timesteps, loaded.remaining_timesteps) == (160, 0)
+    # The schedule has come to its end, too.
+    assert loaded.policy.optimizer.param_groups[0]["lr"] == 0.0
 
 
 def test_no_tensor_is_pickled_with_the_attributes(tmp_path: Path) -> None:
@@ -183,6 +189,7 @@ def test_random_states_kept() -> None:
 # Whole files
 
 
+@pytest.mark.slow
 def test_processes_killed_while_saving_leave_whole_files() -> None:
     said = run_script(SCRIPTS / "kill_during_save.py", 8)
     assert said.startswith("8 kills: 8 files whole")

@@ -12,10 +12,9 @@ from stable_baselines3.common.envs import IdentityEnv, IdentityEnvBox, SimpleMul
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-
-SMALL = {"n_steps": 16, "batch_size": 8}
+from tests.helpers import SMALL
 
 
 @pytest.mark.parametrize(
@@ -25,7 +24,7 @@ SMALL = {"n_steps": 16, "batch_size": 8}
 )
 def test_actions_that_are_not_continuous(space: spaces.Space[Any]) -> None:
     with pytest.raises(ValueError, match=r"need continuous actions.*use PPO of stable_baselines3"):
-        PolicyFlow("MlpPolicy", IdentityEnv(space=space), **SMALL)  # type: ignore[arg-type]
+        PolicyFlow("MlpPolicy", IdentityEnv(space=space), **SMALL)
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.uint8])
@@ -33,7 +32,7 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
     env = IdentityEnvBox()
     env.action_space = spaces.Box(0, 100, (1,), dtype)
     with pytest.raises(ValueError, match=rf"the actions are {dtype.__name__}: declare a Box"):
-        PolicyFlow("MlpPolicy", env, **SMALL)  # type: ignore[arg-type]
+        PolicyFlow("MlpPolicy", env, **SMALL)
 
 
 @pytest.mark.parametrize(
@@ -98,9 +97,50 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
     ],
     ids=str,
 )
-def test_options(options: dict[str, Any], message: str) -> None:
+def test_options_of_policyflow(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PolicyFlow("MlpFlowPolicy", "Pendulum-v1", **{**SMALL, **options})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "message"),
+    [
+        (FPO, {"n_probes": 0}, "n_probes must be at least 1"),
+        (FPO, {"probe_average": "ratio"}, "probe_average must be one of 'loss', 'objective'"),
+        (FPO, {"loss_target": "x0"}, "loss_target must be one of 'epsilon', 'velocity'"),
+        (FPO, {"loss_reduction": "max"}, "loss_reduction must be one of 'mean', 'sum'"),
+        (FPO, {"time_sampler": "beta"}, "time_sampler must be one of"),
+        (FPO, {"trust_region": "trpo"}, "trust_region must be one of 'ppo', 'spo', 'aspo'"),
+        (FPO, {"loss_clamp": 0.0}, "loss_clamp must be positive, or None"),
+        (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, or None"),
+        (FPO, {"action_noise_std": -0.1}, "action_noise_std must be a number from 0"),
+        (FPO, {"solver": "newton"}, "Unknown solver 'newton'"),
+        (FPO, {"n_flow_steps": 0}, "n_flow_steps must be at least 1"),
+        (FPO, {"n_flow_steps": 2.5}, "and a whole number, got 2.5"),
+        (FPO, {"ent_coef": -1.0}, "ent_coef must not be negative"),
+        (FPO, {"n_entropy_actions": 1}, "n_entropy_actions must be at least 2"),
+        (FPO, {"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to FPO itself"),
+        (DPPO, {"process": "vp"}, "process must be one of 'ddpm', 'flow'"),
+        (DPPO, {"n_denoising_steps": 0}, "n_denoising_steps must be at least 1"),
+        (DPPO, {"n_finetuned_steps": 11}, "some of the n_denoising_steps=10, got 11"),
+        (DPPO, {"min_sampling_std": 0.0}, "min_sampling_std must be positive"),
+        (DPPO, {"min_log_prob_std": -1.0}, "min_log_prob_std must be positive"),
+        (DPPO, {"log_prob_clamp": (2.0, -5.0)}, "log_prob_clamp must be two numbers in order"),
+        (DPPO, {"log_prob_clamp": 3.0}, "log_prob_clamp must be two numbers in order, got 3.0"),
+        (DPPO, {"log_prob_reduction": "max"}, "log_prob_reduction must be one of"),
+        (DPPO, {"denoising_gamma": 1.5}, r"denoising_gamma must be in \(0, 1\]"),
+        (DPPO, {"clip_range_base": 0.0}, "clip_range_base must be positive"),
+        (DPPO, {"n_critic_warmup": -1}, "n_critic_warmup must be at least 0"),
+        (DPPO, {"n_entropy_states": 0}, "n_entropy_states must be at least 1"),
+        (DPPO, {"use_sde": True}, "use_sde=True is not supported"),
+    ],
+    ids=str,
+)
+def test_options_of_fpo_and_dppo(
+    algorithm: type[Any], options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        algorithm("MlpPolicy", "Pendulum-v1", **{**SMALL, **options})
 
 
 def test_options_that_do_not_exist_are_not_swallowed() -> None:
@@ -133,11 +173,11 @@ def test_flat_policy_for_dict_observations() -> None:
 def test_buffers_for_other_observations(env: Any, buffer: type[RolloutBuffer]) -> None:
     policy = "MlpPolicy" if isinstance(env, str) else "MultiInputPolicy"
     with pytest.raises(ValueError, match=rf"{buffer.__name__} does not store .*: leave out"):
-        PolicyFlow(policy, env, rollout_buffer_class=buffer, **SMALL)  # type: ignore[arg-type]
+        PolicyFlow(policy, env, rollout_buffer_class=buffer, **SMALL)
 
 
 def test_learning_without_an_environment(tmp_path: Path) -> None:
-    PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")  # type: ignore[arg-type]
+    PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
     with pytest.raises(ValueError, match=r"no environment to learn in: give one to load"):
         PolicyFlow.load(tmp_path / "model").learn(16)
 
@@ -148,7 +188,7 @@ def test_truncated_minibatches_are_announced() -> None:
 
 
 def test_likelihoods_are_refused() -> None:
-    model = PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL)  # type: ignore[arg-type]
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", **SMALL)
     obs, _ = model.policy.obs_to_tensor(gym.make("Pendulum-v1").reset()[0])
     with pytest.raises(TypeError, match="no closed-form likelihood"):
         model.policy.evaluate_actions(obs, obs)

@@ -1,0 +1,80 @@
+"""What the tests share: small runs, and a model's numbers to compare."""
+
+from typing import Any
+
+import torch as th
+from torch import nn
+
+SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1, "seed": 0}
+"""Options of the smallest run that has two minibatches."""
+TWO_EPOCHS: dict[str, Any] = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 0}
+"""Options of a run in which the second epoch finds a policy that has changed."""
+TINY: dict[str, Any] = {"net_arch": [8], "embedding_dim": 8}
+"""``policy_kwargs`` of the smallest networks."""
+
+
+def weights(model: Any) -> th.Tensor:
+    """All that a model's policy is made of, in one vector of float64, shape (n,).
+
+    :param model: A model; its buffers count too, such as the statistics of a ``BatchNorm``.
+    """
+    return th.cat([value.flatten().double() for value in model.policy.state_dict().values()])
+
+
+def assert_trained(model: Any, before: th.Tensor) -> None:
+    """Assert that learning has changed the weights, and left every one of them finite.
+
+    :param model: The model.
+    :param before: Its :func:`weights` before it learned.
+    """
+    after = weights(model)
+    assert th.isfinite(after).all()
+    assert not th.equal(after, before)
+
+
+def train(model: Any, total_timesteps: int, **options: Any) -> Any:
+    """Let a model learn, and assert that it did: see :func:`assert_trained`.
+
+    :param model: The model.
+    :param total_timesteps: For how long.
+    :param options: Other arguments of its ``learn``.
+    :return: The model.
+    """
+    before = weights(model)
+    model.learn(total_timesteps, **options)
+    assert_trained(model, before)
+    return model
+
+
+def perturb(module: nn.Module, scale: float) -> None:
+    """Add noise to all parameters, as an update might.
+
+    :param module: A policy or a part of it.
+    :param scale: Standard deviation of the noise.
+    """
+    with th.no_grad():
+        for parameter in module.parameters():
+            parameter += scale * th.randn_like(parameter)
+
+
+def collect(model: Any) -> Any:
+    """Fill a model's rollout buffer, and learn nothing from it.
+
+    :param model: The model.
+    :return: The model.
+    """
+    total_timesteps = model.n_steps * model.n_envs
+    # SB3 starts an environment in ``learn`` alone.
+    _, callback = model._setup_learn(total_timesteps)
+    assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
+    return model
+
+
+def n_updates(model: Any) -> int:
+    """How many epochs a model has gone through, by its log."""
+    return int(model.logger.name_to_value["train/n_updates"])
+
+
+def last_observations(model: Any) -> Any:
+    """The observations that the next rollout starts with; None if it resets the environment."""
+    return model._last_obs
