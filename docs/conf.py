@@ -24,3 +24,5 @@ autodoc_typehints_description_target = "documented"
 exclude_patterns = ["_build", "results/*/*.md"]
 html_theme = "furo"
 html_title = "sb3-policyflow"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
