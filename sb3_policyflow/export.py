@@ -159,7 +159,7 @@ def export(
     :param path: The file, which ends in ".onnx" or ".pt2".
     :param normalize: The ``VecNormalize`` that the policy was trained with. If it is missing, the
         file takes observations that are normalized already, and returns wrong actions for others.
-    :param latents: Whether the latents z, shape (n, action_dim), are an input. Otherwise they are 0.
+    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise z = 0.
     :raises ValueError: If ``path`` has another suffix.
     """
     path = Path(path)
