@@ -14,12 +14,20 @@ from importlib.machinery import ModuleSpec
 from types import CodeType, ModuleType
 
 MOVED = {
+    "common.aliases": "common.policies",
     "common.arguments": "common.algorithm",
     "common.callbacks": "resilience.checkpoints",
+    "common.chunks": "common.tree",
     "common.collection": "resilience.collection",
     "common.files": "resilience.files",
     "common.finite": "resilience.finite",
+    "common.learning_rate": "common.schedules",
+    "common.metrics": "common.update",
+    "common.ode_policy": "common.policies",
+    "common.on_policy_algorithm": "common.algorithm",
+    "common.optimisation": "common.optimization",
     "common.saving": "resilience.saving",
+    "common.type_aliases": "common.tree",
     "common.workers": "resilience.workers",
     "diagnostics": "callbacks",
     "envs.isaaclab": "integrations.isaaclab",

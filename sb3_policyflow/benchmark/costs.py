@@ -10,10 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_policyflow
-from sb3_policyflow.common.ode_policy import OdeFlowPolicy
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.dppo import DPPO
-from sb3_policyflow.dppo.policies import DPPOPolicy
-from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
 
@@ -45,9 +43,9 @@ class GradientSteps:
 def evaluations_per_action(model: BaseAlgorithm) -> int:
     """Evaluations of the actor's network that one action takes."""
     policy = model.policy
-    if isinstance(policy, OdeFlowPolicy):
-        return policy.n_flow_steps * SOLVERS[policy.solver].evaluations
-    return policy.n_denoising_steps if isinstance(policy, DPPOPolicy) else 1
+    if isinstance(policy, FlowPolicy):
+        return policy.n_evaluations_per_action
+    return 1
 
 
 def evaluations_per_sample(model: BaseAlgorithm) -> int:
@@ -56,12 +54,8 @@ def evaluations_per_sample(model: BaseAlgorithm) -> int:
     PolicyFlow's old velocity counts, which each epoch looks up anew; FPO's old losses, of which
     there is one for all epochs, do not; neither does what an entropy bonus takes.
     """
-    if isinstance(model, PolicyFlow):
-        return 2 * model.n_times
-    if isinstance(model, FPO):
-        return model.n_probes
-    if isinstance(model, DPPO):
-        return len(model.policy.log_prob_stds)
+    if isinstance(model, (PolicyFlow, FPO, DPPO)):
+        return model.n_evaluations_per_sample
     return 1
 
 
