@@ -8,19 +8,16 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_policyflow.benchmark.goals import (
+from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.benchmark.figures.goals import goals_figure
+from sb3_policyflow.benchmark.figures.progress import progress_figure
+from sb3_policyflow.benchmark.measure.entropy import normalized_entropy
+from sb3_policyflow.benchmark.measure.goals import (
     Trajectories,
     evaluate_goals,
     goal_counts,
     goal_report,
-    normalized_entropy,
     sample_trajectories,
-)
-from sb3_policyflow.benchmark.plots import (
-    MONITOR_WINDOW,
-    goals_figure,
-    learning_curve_figure,
-    read_learning_curve,
 )
 from sb3_policyflow.envs.drawing import GOAL_COLORS
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
@@ -195,48 +192,19 @@ def test_goals_figure_gives_trajectories_the_color_of_their_goal():
     assert max(abs(change) for i, change in enumerate(grown) if i != 2) < 100
 
 
-def test_learning_curves_of_a_real_run(tmp_path):
-    env = VecMonitor(MultiGoalVecEnv(4, seed=0), str(tmp_path / "run"))
+def test_progress_figure_of_a_real_run(tmp_path):
+    env = VecMonitor(MultiGoalVecEnv(4, seed=0))
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1, device="cpu")
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(4 * 64 * 5)
-    steps, returns = read_learning_curve(tmp_path / "progress.csv")
-    np.testing.assert_array_equal(steps, 256 * np.arange(1, 6))
-    assert len(returns) == 5
-    monitor_steps, monitor_returns = read_learning_curve(tmp_path / "run.monitor.csv")
-    assert monitor_steps[-1] <= 4 * 64 * 5
-    assert monitor_returns[-1] == pytest.approx(returns[-1], abs=1e-4)
+    [axes] = progress_figure(tmp_path / "progress.csv").get_axes()
+    [line] = axes.get_lines()
+    np.testing.assert_array_equal(line.get_xdata(), 256 * np.arange(1, 6))
+    last = np.mean([episode["r"] for episode in model.ep_info_buffer])
+    assert line.get_ydata()[-1] == pytest.approx(last, abs=1e-4)
 
 
-def test_monitor_returns_are_running_means(tmp_path):
-    file = tmp_path / "a.monitor.csv"
-    values = range(2 * MONITOR_WINDOW)
-    file.write_text('#{"t_start": 0}\nr,l,t\n' + "".join(f"{v},10,0.5\n" for v in values))
-    steps, returns = read_learning_curve(file)
-    assert steps[-1] == 20 * MONITOR_WINDOW
-    assert returns[0] == 0.0
-    assert returns[1] == 0.5
-    assert returns[-1] == np.mean(range(MONITOR_WINDOW, 2 * MONITOR_WINDOW))
-
-
-@pytest.mark.parametrize(
-    "text", ["", "a,b\n1,2\n", "r,l,t\n", "rollout/ep_rew_mean,time/total_timesteps\n,50\n"]
-)
-def test_other_files_are_refused(tmp_path, text):
-    (tmp_path / "x.csv").write_text(text)
-    with pytest.raises(ValueError, match="neither"):
-        read_learning_curve(tmp_path / "x.csv")
-
-
-def test_learning_curve_figure_averages_seeds(tmp_path):
-    header = "rollout/ep_rew_mean,time/total_timesteps\n"
-    for name, slope in [("a", 1), ("b", 3), ("c", 5)]:
-        rows = "".join(f"{slope * i},{100 * i}\n" for i in range(1, 5))
-        (tmp_path / name).write_text(header + ",50\n" + rows)
-    figure = learning_curve_figure({"x": [tmp_path / "a", tmp_path / "b"], "y": tmp_path / "c"})
-    (axes,) = figure.get_axes()
-    x, y = axes.get_lines()
-    assert (x.get_ydata()[0], x.get_ydata()[-1]) == (2.0, 8.0)
-    assert (y.get_xdata()[0], y.get_xdata()[-1]) == (100.0, 400.0)
-    assert len(axes.collections) == 1, "a band for the name with two seeds"
-    assert rendered(figure).std() > 0
+def test_progress_without_a_finished_episode_is_refused(tmp_path):
+    (tmp_path / "progress.csv").write_text("time/total_timesteps\n50\n")
+    with pytest.raises(BenchmarkError, match="no finished episode"):
+        progress_figure(tmp_path / "progress.csv")

@@ -9,12 +9,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 pytest.importorskip("gymnasium_robotics")
 
-from sb3_policyflow.benchmark.visits import (
-    CELL_SIZE,
-    VisitCounter,
-    VisitMap,
-    density_figure,
-)
+from sb3_policyflow.benchmark.figures.visits import density_figure
+from sb3_policyflow.benchmark.measure.visits import CELL_SIZE, VisitCounter, VisitMap
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.envs.point_maze import ENV_ID
 

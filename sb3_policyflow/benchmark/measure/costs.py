@@ -1,34 +1,16 @@
-"""What a training costs: gradient steps, network evaluations, versions and time."""
+"""What a training costs: gradient steps and evaluations of networks."""
 
-import importlib.metadata
-import platform
-import subprocess
-from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-import sb3_policyflow
 from sb3_policyflow.common.ode_policy import OdeFlowPolicy
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.dppo.policies import DPPOPolicy
 from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
-
-PACKAGES = (
-    "gymnasium",
-    "jax",
-    "mujoco",
-    "mujoco-mjx",
-    "numba",
-    "numpy",
-    "playground",
-    "rl_zoo3",
-    "stable-baselines3",
-    "torch",
-)
 
 
 class GradientSteps:
@@ -70,39 +52,9 @@ def network_evaluations(model: OnPolicyAlgorithm, gradient_steps: int) -> dict[s
 
     Those for updating are of full minibatches: the last of an epoch may have been smaller.
     """
-    algorithm: Any = model  # those that are compared all have a batch size
+    # A2C, which has no minibatches, updates with the whole rollout.
+    batch_size = getattr(model, "batch_size", model.n_steps * model.n_envs)
     return {
         "acting": model.num_timesteps * evaluations_per_action(model),
-        "updating": gradient_steps * algorithm.batch_size * evaluations_per_sample(model),
+        "updating": gradient_steps * batch_size * evaluations_per_sample(model),
     }
-
-
-def commit() -> str | None:
-    """The commit of a checkout, with a "+" if files differ from it; None if it is none."""
-
-    def git(*arguments: str) -> str:
-        folder = Path(sb3_policyflow.__file__).parent
-        command = ["git", "-C", str(folder), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of what a training depends on; None for what is not installed."""
-    return {
-        "python": platform.python_version(),
-        "sb3_policyflow": sb3_policyflow.__version__,
-        "commit": commit(),
-        **{package: _version(package) for package in PACKAGES},
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -11,13 +11,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_policyflow.benchmark.goals import seeded
+from sb3_policyflow.benchmark.measure.seeding import seeded
 from sb3_policyflow.common.policies import FlowActorCriticPolicy
 
 EVALUATION_SEED = 1_000_000
 """Far from the seeds of trainings; every evaluation starts from the same states."""
 
 STOCHASTIC, LATENT_ONLY, DETERMINISTIC = "stochastic", "latent-only", "deterministic"
+MODES = (STOCHASTIC, LATENT_ONLY, DETERMINISTIC)
 
 
 def modes(model: BaseAlgorithm) -> tuple[str, ...]:
@@ -28,7 +29,7 @@ def modes(model: BaseAlgorithm) -> tuple[str, ...]:
 
 
 @contextmanager
-def _latents_drawn(model: BaseAlgorithm, mode: str) -> Iterator[None]:
+def _random_latents_enabled(model: BaseAlgorithm, mode: str) -> Iterator[None]:
     if mode != LATENT_ONLY:
         yield
         return
@@ -49,7 +50,7 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, mode: str, n_episodes: int) -> d
     if training_env is not None:
         sync_envs_normalization(training_env, env)
     env.seed(EVALUATION_SEED)
-    with seeded(EVALUATION_SEED), _latents_drawn(model, mode):
+    with seeded(EVALUATION_SEED, model.device), _random_latents_enabled(model, mode):
         returns, lengths = evaluate_policy(
             model,
             env,
