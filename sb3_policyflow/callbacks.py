@@ -7,15 +7,16 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.checks import check_count
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.checks import at_least
 from sb3_policyflow.common.entropy import action_entropy
 from sb3_policyflow.common.losses import gaussian_kl, shifted_gaussian_log_ratio
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows
+from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
+from sb3_policyflow.common.tree import rows
 from sb3_policyflow.flows import TIME_SAMPLERS
-from sb3_policyflow.policyflow import FlowPolicy, PolicyFlow
-from sb3_policyflow.resilience.saving import random_states_kept
+from sb3_policyflow.policyflow import PolicyFlow, PolicyFlowPolicy
+from sb3_policyflow.resilience.saving import preserve_rng_state
 
 
 class Shifts(NamedTuple):
@@ -70,16 +71,16 @@ class FlowDiagnosticsCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        check_count("every", every, 1)
-        check_count("n_samples", n_samples, 2)
-        check_count("n_entropy_states", n_entropy_states, 0)
-        check_count("n_entropy_actions", n_entropy_actions, 2)
+        at_least(1)("every", every)
+        at_least(2)("n_samples", n_samples)
+        at_least(0)("n_entropy_states", n_entropy_states)
+        at_least(2)("n_entropy_actions", n_entropy_actions)
         self.every = every
         self.n_samples = n_samples
         self.n_entropy_states = n_entropy_states
         self.n_entropy_actions = n_entropy_actions
         self.n_rollouts = 0
-        self._before: tuple[FlowActorCriticPolicy, FlowRolloutBufferSamples] | None = None
+        self._before: tuple[BaseFlowPolicy, FlowRolloutBufferSamples] | None = None
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, FlowOnPolicyAlgorithm):
@@ -96,7 +97,7 @@ class FlowDiagnosticsCallback(BaseCallback):
         """Keep the policy and some of the rollout, before the update changes the policy."""
         self.n_rollouts += 1
         if self.n_rollouts % self.every == 0:
-            with random_states_kept(self.model.device), th.no_grad():
+            with preserve_rng_state(self.model.device), th.no_grad():
                 self._before = deepcopy(self.algorithm.policy), self._sample()
 
     def _sample(self) -> FlowRolloutBufferSamples:
@@ -121,17 +122,17 @@ class FlowDiagnosticsCallback(BaseCallback):
         (old, samples), self._before = self._before, None
         new = self.algorithm.policy
         new.set_training_mode(False)
-        with random_states_kept(self.model.device), th.no_grad():
-            figures = {}
-            if isinstance(old, FlowPolicy) and isinstance(new, FlowPolicy):
-                figures = self._compare(old, new, samples)
+        with preserve_rng_state(self.model.device), th.no_grad():
+            metrics = {}
+            if isinstance(old, PolicyFlowPolicy) and isinstance(new, PolicyFlowPolicy):
+                metrics = self._compare(old, new, samples)
             if self.n_entropy_states > 0:
-                figures["action_entropy"] = self._entropy(new, samples.observations)
-        for name, value in figures.items():
+                metrics["action_entropy"] = self._entropy(new, samples.observations)
+        for name, value in metrics.items():
             self.logger.record(f"diagnostics/{name}", value.item())
 
     def _compare(
-        self, old: FlowPolicy, new: FlowPolicy, samples: FlowRolloutBufferSamples
+        self, old: PolicyFlowPolicy, new: PolicyFlowPolicy, samples: FlowRolloutBufferSamples
     ) -> dict[str, th.Tensor]:
         shifts = end_point_shifts(old, new, samples, self._draw_times(samples))
         noise = samples.actions - samples.record.endpoints
@@ -156,17 +157,20 @@ class FlowDiagnosticsCallback(BaseCallback):
         """Times as the algorithm draws them, shape (n, n_times)."""
         model = self.algorithm
         assert isinstance(model, PolicyFlow)
-        times = TIME_SAMPLERS[model.time_sampler](model.policy.solver_times())
+        times = TIME_SAMPLERS[model.time_sampler](model.policy.flow.times())
         return times.sample(len(samples.actions), model.n_times)
 
-    def _entropy(self, policy: FlowActorCriticPolicy, observations: PyTorchObs) -> th.Tensor:
+    def _entropy(self, policy: BaseFlowPolicy, observations: PyTorchObs) -> th.Tensor:
         """Entropy of the actions in nats, mean over states."""
         some = rows(observations, slice(self.n_entropy_states))
         return action_entropy(policy, policy.actor_features(some), self.n_entropy_actions)
 
 
 def end_point_shifts(
-    old: FlowPolicy, new: FlowPolicy, samples: FlowRolloutBufferSamples, times: th.Tensor
+    old: PolicyFlowPolicy,
+    new: PolicyFlowPolicy,
+    samples: FlowRolloutBufferSamples,
+    times: th.Tensor,
 ) -> Shifts:
     """How far the ends of the flow have moved between two policies.
 
@@ -177,16 +181,16 @@ def end_point_shifts(
     """
     latents = samples.record.latents
     features = {policy: policy.actor_features(samples.observations) for policy in (old, new)}
-    exact = new.carry(latents, features[new]) - old.carry(latents, features[old])
-    grid = old.solver_times().expand(len(latents), -1)
+    exact = new.transport(latents, features[new]) - old.transport(latents, features[old])
+    grid = old.flow.times().expand(len(latents), -1)
 
     def mean_change(at: th.Tensor) -> th.Tensor:
         ends = samples.record.endpoints.unsqueeze(1)
-        points = old.path.interpolate(latents.unsqueeze(1), ends, at)
+        points = old.flow.interpolant.interpolate(latents.unsqueeze(1), ends, at)
         after, before = (
             policy.velocity(points, at, features[policy].unsqueeze(1)) for policy in (new, old)
         )
-        change: th.Tensor = old.path.end_time * (after - before).mean(dim=1)
+        change: th.Tensor = old.flow.interpolant.end_time * (after - before).mean(dim=1)
         return change
 
     return Shifts(exact, mean_change(grid), mean_change(times))

@@ -19,8 +19,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow
@@ -67,9 +67,7 @@ class ActionModule(nn.Module):
     low: th.Tensor
     high: th.Tensor
 
-    def __init__(
-        self, policy: FlowActorCriticPolicy, normalize: VecNormalize | None = None
-    ) -> None:
+    def __init__(self, policy: FlowPolicy, normalize: VecNormalize | None = None) -> None:
         super().__init__()
         self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
         self.policy.set_training_mode(False)
@@ -91,7 +89,7 @@ class ActionModule(nn.Module):
         features = self.policy.actor_features(self._normalized(observations))
         if latents is None:
             latents = features.new_zeros(features.shape[0], self.policy.action_dim)
-        actions = self.policy.carry(latents, features).reshape(-1, *self.low.shape)
+        actions = self.policy.transport(latents, features).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return actions.clamp(self.low, self.high)
@@ -137,7 +135,7 @@ def _normalizers(
 
 
 def export(
-    policy: FlowActorCriticPolicy,
+    policy: FlowPolicy,
     path: str | Path,
     normalize: VecNormalize | None = None,
     latents: bool = False,
@@ -190,7 +188,7 @@ def _write_onnx(program: th.export.ExportedProgram, example: tuple[Any, ...], pa
     )
 
 
-def load_policy(path: str | Path) -> FlowActorCriticPolicy:
+def load_policy(path: str | Path) -> FlowPolicy:
     """The policy of a saved model, whichever algorithm trained it.
 
     :param path: The model's zip file.

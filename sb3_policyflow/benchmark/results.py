@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_policyflow.benchmark.errors import BenchmarkError
-from sb3_policyflow.resilience.files import written_whole
+from sb3_policyflow.resilience.files import atomic_write
 
 DEFAULT_FOLDER = Path("benchmark-results")
 
@@ -87,7 +87,7 @@ class Result:
             writer.writeheader()
             writer.writerows(self.curve)
         text = json.dumps({"run": asdict(self.run), **self.summary}, indent=1)
-        with written_whole(path) as file:
+        with atomic_write(path) as file:
             file.write(f"{text}\n".encode())
 
     @classmethod

@@ -1,16 +1,33 @@
 """Rollout buffers that also store how each action was made."""
 
 from collections.abc import Generator, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows, size_in_bytes
+from sb3_policyflow.common.tree import rows, size_in_bytes
 
 SHUFFLED_AT_ONCE = 2**26
 """Bytes of a rollout up to which a shuffled copy of it is made for each epoch."""
+
+
+class FlowRolloutBufferSamples(NamedTuple):
+    """Transitions with the record of how each action was made; n samples along the first axis.
+
+    ``record`` is what the policy's ``forward`` returned, a NamedTuple of tensors (n, ...).
+    ``drawn`` is what an update draws anew in each epoch, a NamedTuple of tensors (n, ...) too.
+    """
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    old_values: th.Tensor
+    advantages: th.Tensor
+    returns: th.Tensor
+    record: Any
+    drawn: Any = ()
 
 
 class RecordBufferMixin(RolloutBuffer):
@@ -27,7 +44,7 @@ class RecordBufferMixin(RolloutBuffer):
         """Forget all transitions."""
         self.record_type = None
         super().reset()
-        # SB3 takes the precision of the space. Half of it would blur how an action was made.
+        # SB3 stores actions in the dtype of the space, which may have less than single precision.
         self.actions = self.actions.astype(np.float32, copy=False)
 
     def add(
@@ -54,7 +71,7 @@ class RecordBufferMixin(RolloutBuffer):
             self._allocate(record)
         for name, values in record._asdict().items():
             getattr(self, name)[self.pos] = values.cpu().numpy()
-        # Whoever reads log probabilities from this buffer by mistake shall see it at once.
+        # NaN shows at once where log probabilities are read from this buffer by mistake.
         no_log_prob = th.full((self.n_envs,), th.nan)
         super().add(obs, action, reward, episode_start, value, no_log_prob)
 
@@ -74,8 +91,13 @@ class RecordBufferMixin(RolloutBuffer):
         record = self.record_type(
             *(self._flatten(getattr(self, name)) for name in self.record_type._fields)
         )
+        observations: Any = self.observations
+        if isinstance(observations, dict):
+            observations = {key: self._flatten(values) for key, values in observations.items()}
+        else:
+            observations = self._flatten(observations)
         return FlowRolloutBufferSamples(
-            observations=self._flat_observations(),
+            observations=observations,
             actions=self._flatten(self.actions),
             old_values=self._flatten(self.values),
             advantages=self._flatten(self.advantages),
@@ -87,9 +109,6 @@ class RecordBufferMixin(RolloutBuffer):
         flat = array.reshape(self.buffer_size * self.n_envs, *array.shape[2:])
         return th.as_tensor(flat, device=self.device)
 
-    def _flat_observations(self) -> Any:
-        return self._flatten(self.observations)
-
     def minibatches(
         self, samples: FlowRolloutBufferSamples, batch_size: int | None = None
     ) -> Iterator[FlowRolloutBufferSamples]:
@@ -97,7 +116,7 @@ class RecordBufferMixin(RolloutBuffer):
 
         The order is the one in which SB3's buffer gives back its transitions.
 
-        :param samples: What :meth:`samples` returned, perhaps with probes added.
+        :param samples: What :meth:`samples` returned, perhaps with something drawn for each.
         :param batch_size: Samples in a minibatch; all of them if not given.
         """
         n_samples = self.buffer_size * self.n_envs
@@ -126,6 +145,3 @@ class FlowRolloutBuffer(RecordBufferMixin):
 
 class DictFlowRolloutBuffer(RecordBufferMixin, DictRolloutBuffer):
     """SB3's ``DictRolloutBuffer`` with the record of a flow policy."""
-
-    def _flat_observations(self) -> dict[str, th.Tensor]:
-        return {key: self._flatten(values) for key, values in self.observations.items()}

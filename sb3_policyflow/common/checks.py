@@ -1,8 +1,8 @@
-"""Checks of what the user asks for, made before any work is done."""
+"""Checks of the user's arguments, made before any work is done."""
 
 import math
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -15,74 +15,107 @@ from sb3_policyflow.common.buffers import (
     FlowRolloutBuffer,
     RecordBufferMixin,
 )
+from sb3_policyflow.flows.choices import choose
+
+Check = Callable[[str, object], object]
+"""``check(name, value)`` raises a ``ValueError`` that says what ``name`` must be."""
 
 
-def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Refuse a value that is not among the choices.
+def check_options(options: object) -> None:
+    """Check the attributes that the tables ``option_checks`` of a class and its bases name.
 
-    :raises ValueError: With the choices.
+    :raises ValueError: With the first one that cannot be used.
     """
-    if value not in choices:
-        known = ", ".join(repr(choice) for choice in choices)
-        raise ValueError(f"{name} must be one of {known}, got {value!r}.")
+    for cls in reversed(type(options).__mro__):
+        for name, check in vars(cls).get("option_checks", {}).items():
+            check(name, getattr(options, name))
 
 
-def check_count(name: str, value: object, lowest: int) -> None:
-    """Refuse what is not a whole number, or too small.
+def one_of(choices: Collection[str]) -> Check:
+    """One of some names.
 
-    :raises ValueError: With the lowest value that is allowed.
+    >>> one_of(("sum", "mean"))("reduction", "max")
+    Traceback (most recent call last):
+    ...
+    ValueError: reduction must be one of 'sum', 'mean', got 'max'.
     """
-    if not isinstance(value, Integral) or not int(value) >= lowest:
-        raise ValueError(f"{name} must be at least {lowest}, and a whole number, got {value!r}.")
+
+    def check(name: str, value: object) -> None:
+        choose(name, value, dict.fromkeys(choices))
+
+    return check
 
 
-def check_between(name: str, value: object, lowest: float, highest: float = math.inf) -> None:
-    """Refuse a number that is out of range; schedules, which are functions, pass.
+def at_least(lowest: int) -> Check:
+    """A whole number that is not too small."""
 
-    :raises ValueError: With the range.
-    """
-    if callable(value):
-        return
-    if not isinstance(value, Real) or not lowest <= float(value) <= highest:
-        raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
+    def check(name: str, value: object) -> None:
+        if not isinstance(value, Integral) or not int(value) >= lowest:
+            raise ValueError(
+                f"{name} must be at least {lowest}, and a whole number, got {value!r}."
+            )
+
+    return check
 
 
-def check_number(name: str, value: object) -> None:
-    """Refuse what is not a finite number.
+def between(lowest: float, highest: float = math.inf) -> Check:
+    """A number in a range, or a schedule, which is a function and passes."""
 
-    :raises ValueError: If it is not.
-    """
+    def check(name: str, value: object) -> None:
+        if callable(value):
+            return
+        if not isinstance(value, Real) or not lowest <= float(value) <= highest:
+            raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
+
+    return check
+
+
+def finite(name: str, value: object) -> None:
+    """A finite number."""
     if not isinstance(value, Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}.")
 
 
-def check_positive(name: str, value: object) -> None:
-    """Refuse a number that is not positive.
-
-    :raises ValueError: If it is not.
-    """
+def positive(name: str, value: object) -> None:
+    """A positive number."""
     if not isinstance(value, Real) or not float(value) > 0:
         raise ValueError(f"{name} must be positive, got {value!r}.")
 
 
-def check_bounds(name: str, value: object) -> None:
-    """Refuse what is not a lowest and a highest number, which may be the same.
+def positive_up_to(highest: float) -> Check:
+    """A positive number that is not too large."""
 
-    :raises ValueError: If it is not.
-    """
-    bounds = list(value) if isinstance(value, Sequence) else []
-    are_numbers = all(isinstance(bound, Real) for bound in bounds)
-    if len(bounds) != 2 or not are_numbers or not bounds[0] <= bounds[1]:
+    def check(name: str, value: object) -> None:
+        if not isinstance(value, Real) or not 0 < float(value) <= highest:
+            raise ValueError(f"{name} must be in (0, {highest:g}], got {value!r}.")
+
+    return check
+
+
+def positive_or_none(name: str, value: object) -> None:
+    """A positive number, or None for no bound; schedules, which are functions, pass."""
+    if value is None or callable(value):
+        return
+    if not isinstance(value, Real) or not float(value) > 0:
+        raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
+
+
+def bounds(name: str, value: object) -> None:
+    """A lowest and a highest number, which may be the same."""
+    ends = list(value) if isinstance(value, Sequence) else []
+    are_numbers = all(isinstance(end, Real) for end in ends)
+    if len(ends) != 2 or not are_numbers or not ends[0] <= ends[1]:
         raise ValueError(f"{name} must be two numbers in order, got {value!r}.")
 
 
-def check_positive_or_none(name: str, value: object) -> None:
-    """Refuse a bound that leaves nothing.
+def or_none(check: Check) -> Check:
+    """What another check allows, or None."""
 
-    :raises ValueError: If there is one that is not a positive number.
-    """
-    if value is not None and (not isinstance(value, Real) or not float(value) > 0):
-        raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
+    def check_unless_none(name: str, value: object) -> None:
+        if value is not None:
+            check(name, value)
+
+    return check_unless_none
 
 
 def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any]) -> None:
@@ -96,6 +129,29 @@ def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any])
             f"{getattr(policy_class, '__name__', policy_class)}: use 'MlpFlowPolicy', "
             "'CnnFlowPolicy' or 'MultiInputFlowPolicy', or derive your own from "
             f"{base.__module__}.{base.__name__}."
+        )
+
+
+def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
+    """Refuse what a flow policy cannot do.
+
+    :raises ValueError: If the actions are not continuous or not floats, or gSDE is asked for.
+    """
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(
+            f"Flow policies need continuous actions (a Box), but the action space is "
+            f"{action_space}: use PPO of stable_baselines3 for it."
+        )
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(
+            f"Flow policies draw real numbers, but the actions are {action_space.dtype}: declare a "
+            "Box of np.float32, and round in the environment (gymnasium.wrappers.TransformAction)."
+        )
+    if use_sde:
+        raise ValueError(
+            "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
+            "leave it out. The noise has options of its own, such as PolicyFlow's "
+            "policy_kwargs=dict(log_std_init=...)."
         )
 
 
@@ -128,7 +184,7 @@ def choose_buffer_class(
         return default
     if not issubclass(given, RecordBufferMixin):
         raise ValueError(
-            f"{algorithm} needs a rollout buffer that keeps how each action was made, which "
+            f"{algorithm} needs a rollout buffer that stores how each action was made, which "
             f"{given.__name__} does not: leave out rollout_buffer_class, or derive yours from "
             f"{default.__module__}.{default.__name__}."
         )
@@ -147,7 +203,7 @@ def check_batches(batch_size: int, n_steps: int, n_envs: int, normalize_advantag
     :raises ValueError: If advantages would be normalized over one sample.
     """
     buffer_size = n_steps * n_envs
-    check_count("batch_size", batch_size, 2 if normalize_advantage else 1)
+    at_least(2 if normalize_advantage else 1)("batch_size", batch_size)
     if normalize_advantage and buffer_size < 2:
         raise ValueError(
             "Advantages cannot be normalized over one sample: n_steps * n_envs must be greater "

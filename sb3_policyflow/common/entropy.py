@@ -1,12 +1,11 @@
-"""The entropy of actions, for policies that can only be drawn from."""
+"""The entropy of actions, for policies that can be sampled but have no likelihood."""
 
 import math
+from typing import NamedTuple
 
 import torch as th
 
-from sb3_policyflow.common import checks
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.common.policies import FlowPolicy
 
 SMALLEST_DISTANCE = 1e-6
 """Actions nearer than this count as this far apart: clipped ones may coincide."""
@@ -36,7 +35,7 @@ def nearest_neighbor_entropy(samples: th.Tensor) -> th.Tensor:
     return harmonic + log_ball + dim * nearest.log().mean()
 
 
-def action_entropy(policy: FlowActorCriticPolicy, features: th.Tensor, n_actions: int) -> th.Tensor:
+def action_entropy(policy: FlowPolicy, features: th.Tensor, n_actions: int) -> th.Tensor:
     """Entropy of a policy's actions in nats, from several in each state, mean over the states.
 
     :param policy: The policy, through whose steps the entropy is differentiated.
@@ -47,29 +46,30 @@ def action_entropy(policy: FlowActorCriticPolicy, features: th.Tensor, n_actions
     return nearest_neighbor_entropy(actions.reshape(len(features), n_actions, -1))
 
 
-class SampledEntropyMixin(FlowOnPolicyAlgorithm):
-    """Rewards the entropy of the actions, estimated from several in each of some states.
+class EntropyBonus(NamedTuple):
+    """Rewards the entropy of the actions, estimated from several actions in each of some states.
 
-    It is off, and costs nothing, while ``ent_coef`` is 0. The actions are differentiated through
-    all steps that make them.
+    It costs nothing while its coefficient is 0. The gradient goes through all the steps that make
+    an action.
+
+    :param coef: ``ent_coef`` at the present progress.
+    :param n_actions: Actions drawn in each state.
+    :param n_states: States of a minibatch in which they are drawn, at most.
     """
 
-    n_entropy_actions: int
-    n_entropy_states: int
+    coef: float
+    n_actions: int
+    n_states: int
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        checks.check_count("n_entropy_actions", self.n_entropy_actions, 2)
-        checks.check_count("n_entropy_states", self.n_entropy_states, 1)
+    def regularizer(
+        self, policy: FlowPolicy, features: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """What the entropy adds to the loss, and the metrics to log.
 
-    def _entropy_bonus(self, features: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """What the entropy adds to the loss, and what to log of it.
-
+        :param policy: The policy.
         :param features: The actor's features of a minibatch in random order, (n, features_dim).
         """
-        ent_coef = self._now(self._entropy_schedule)
-        if ent_coef == 0:
+        if self.coef == 0:
             return features.new_zeros(()), {}
-        some = features[: self.n_entropy_states]
-        entropy = action_entropy(self.policy, some, self.n_entropy_actions)
-        return -ent_coef * entropy, {"entropy_loss": -entropy}
+        entropy = action_entropy(policy, features[: self.n_states], self.n_actions)
+        return -self.coef * entropy, {"entropy_loss": -entropy}

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch as th
+from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 SMALLEST_CLIP_RANGE = 1e-6
 """Epsilon of the penalties that divide by it, at least."""
@@ -128,6 +129,30 @@ SURROGATES: dict[str, Callable[[th.Tensor, th.Tensor, float | th.Tensor], th.Ten
     "aspo": asymmetric_surrogate,
 }
 """Objectives that keep the policy near the old one, by the name of their trust region."""
+
+
+def normalize(advantages: th.Tensor) -> th.Tensor:
+    """Advantages, shape (n,), of mean 0 and standard deviation 1."""
+    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def clipped_value_loss(
+    values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float | None
+) -> th.Tensor:
+    """Mean squared error of the values, whose change is clipped as in SB3's PPO.
+
+    >>> one, three = th.ones(1), th.full((1,), 3.0)
+    >>> [clipped_value_loss(three, one, one, epsilon).item() for epsilon in (None, 0.5)]
+    [4.0, 0.25]
+
+    :param values: Shape (n,).
+    :param old_values: Those of the rollout, shape (n,).
+    :param returns: The TD(lambda) returns, shape (n,).
+    :param clip_range: Greatest change of a value; None for no clipping.
+    """
+    if clip_range is not None:
+        values = old_values + (values - old_values).clamp(-clip_range, clip_range)
+    return F.mse_loss(returns, values)
 
 
 def ratio_divergence(log_ratio: th.Tensor) -> th.Tensor:

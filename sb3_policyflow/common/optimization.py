@@ -4,11 +4,9 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
 import torch as th
 
-from sb3_policyflow.kernels.compiler import kernels
-from sb3_policyflow.kernels.networks import addresses, in_memory
+from sb3_policyflow.kernels import clip_gradients_in_place
 
 
 def make_optimizer(
@@ -48,11 +46,10 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math
     :return: The norm that they had.
     """
     grads = [p.grad for p in parameters if p.grad is not None]
-    module = kernels()
-    if module is not None and in_memory(grads):
-        sizes = np.array([grad.numel() for grad in grads])
-        return float(module.clip(addresses(grads), sizes, max_norm))
-    norm: float = th.cat([grad.reshape(-1) for grad in grads]).norm().item()
+    norm = clip_gradients_in_place(grads, max_norm)
+    if norm is not None:
+        return norm
+    norm = float(th.cat([grad.reshape(-1) for grad in grads]).norm())
     factor = max_norm / (norm + 1e-6)
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)

@@ -1,14 +1,13 @@
-"""What the policies of all flow algorithms share: networks, values and the way of an action."""
+"""What the policies of all flow algorithms share: networks, values, and how an action is made."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -19,19 +18,21 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_policyflow.common import checks
 from sb3_policyflow.common.optimization import make_optimizer
-from sb3_policyflow.kernels.fields import FusedVelocityField
-from sb3_policyflow.kernels.networks import Perceptron, Reader, Reading, is_eager
-from sb3_policyflow.kernels.perceptron import evaluate_perceptron
+from sb3_policyflow.common.options import accepts_former_names, own_options
+from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
+from sb3_policyflow.kernels import KernelCritic, make_velocity_field
 
 NetArch = list[int] | dict[str, list[int]]
 
 
-class FlowActorCriticPolicy(ActorCriticPolicy):
+class FlowPolicy(ActorCriticPolicy):
     """An actor-critic policy whose actor is a velocity field.
 
     ``forward`` returns actions, values and a record: a NamedTuple of tensors that says how the
-    actions were made. Siblings differ in :meth:`sample_actions`.
+    actions were made. The algorithms' policies differ in :meth:`sample_actions`. Their own options
+    are keyword-only, and may be given to the algorithm too.
 
     :param observation_space: Observation space.
     :param action_space: Action space, a Box.
@@ -42,7 +43,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :param ortho_init: Whether to initialize features extractor and critic orthogonally, as SB3
         does. The velocity field has its own ``initialization``.
     :param use_sde: Not supported.
-    :param features_extractor_class: Features extractor.
+    :param features_extractor_class: Features extractor; by default that of the class.
     :param features_extractor_kwargs: Keyword arguments of the features extractor.
     :param share_features_extractor: Whether actor and critic share the features extractor.
     :param normalize_images: Whether to divide images by 255.
@@ -57,7 +58,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
     :raises ValueError: If an option is not supported.
     """
 
-    own_parameters: ClassVar[tuple[str, ...]] = (
+    shared_options: ClassVar[tuple[str, ...]] = (
         "share_features_extractor",
         "embedding_dim",
         "frequencies",
@@ -65,10 +66,17 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         "initialization",
         "random_latents",
     )
-    """Constructor arguments that SB3's ``save`` of a policy does not know of."""
+    """Constructor arguments of all flow policies that SB3's ``save`` of a policy does not know."""
+    default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "embedding_dim": checks.at_least(1),
+        "initialization": checks.one_of(INITIALIZATIONS),
+    }
 
+    velocity: VelocityField
     mlp_extractor: MlpExtractor
 
+    @accepts_former_names(initialisation="initialization")
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -78,7 +86,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         activation_fn: type[nn.Module] = nn.Tanh,
         ortho_init: bool = True,
         use_sde: bool = False,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = True,
         normalize_images: bool = True,
@@ -90,12 +98,14 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         initialization: str = "glorot_zero_output",
         random_latents: bool = False,
     ) -> None:
-        check_flow_spaces(action_space, use_sde)
+        checks.check_flow_spaces(action_space, use_sde)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
         self.initialization = initialization
         self.random_latents = random_latents
+        checks.check_options(self)
+        features_extractor_class = features_extractor_class or self.default_features_extractor_class
         if net_arch is None and features_extractor_class is NatureCNN:
             # SB3 puts no layer behind its CNN, but a velocity without one is linear in the action.
             net_arch = {"pi": [64, 64], "vf": []}
@@ -118,7 +128,8 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         data = super()._get_constructor_parameters()
         for foreign in ("use_sde", "full_std", "use_expln", "squash_output", "log_std_init"):
             del data[foreign]
-        return {**data, **{name: getattr(self, name) for name in self.own_parameters}}
+        own = [option.name for option in own_options(type(self)) if hasattr(self, option.name)]
+        return {**data, **{name: getattr(self, name) for name in (*self.shared_options, *own)}}
 
     @property
     def action_dim(self) -> int:
@@ -141,17 +152,20 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        # Those of a Gaussian actor, as is the optimizer.
+        # SB3 has made those of a Gaussian actor, and the optimizer of its parameters.
         del self.action_net, self.log_std
         self._build_actor()
-        self._critic = Reading(read_critic)
+        self._kernel_critic = KernelCritic()
         self.optimizer = make_optimizer(
             self.optimizer_class, self.parameters(), lr_schedule(1), self.optimizer_kwargs
         )
 
+    @abstractmethod
     def _build_actor(self) -> None:
-        """Build what the actor learns, apart from the features extractor."""
-        self.velocity = FusedVelocityField(
+        """Build what the actor learns: ``velocity``, and what else the policy has."""
+
+    def _make_velocity_field(self) -> VelocityField:
+        return make_velocity_field(
             self.action_dim,
             self.features_dim,
             net_arch=self._layers("pi"),
@@ -161,6 +175,13 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
             frequency_scale=self.frequency_scale,
             initialization=self.initialization,
         )
+
+    def critic_parameters(self) -> Iterator[nn.Parameter]:
+        """The parameters that serve the critic alone."""
+        yield from self.mlp_extractor.value_net.parameters()
+        yield from self.value_net.parameters()
+        if not self.share_features_extractor:
+            yield from self.vf_features_extractor.parameters()
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim)."""
@@ -179,8 +200,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
-        network = self._critic.of(self) if is_eager() else None
-        values = None if network is None else evaluate_perceptron(network, features)
+        values = self._kernel_critic(self, features)
         if values is None:
             values = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
@@ -191,9 +211,14 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
         return draw(size, device=features.device, dtype=features.dtype)
 
+    @property
     @abstractmethod
-    def carry(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """Carry latents to actions, with no noise on the way nor at the end.
+    def n_evaluations_per_action(self) -> int:
+        """Evaluations of the velocity field for one action."""
+
+    @abstractmethod
+    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Transport latents to actions, without noise on the way or at the end.
 
         :param latents: z, shape (n, action_dim).
         :param features: The actor's features, shape (n, features_dim).
@@ -233,7 +258,7 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         return actions.reshape(-1, *self.action_space.shape)
 
     def keep_within_bounds(self) -> None:
-        """Put parameters that have bounds back into them, after a step of the optimizer."""
+        """Clamp parameters that have bounds, after a step of the optimizer."""
 
     def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
         """Refuse: SB3's distributions say how likely actions are."""
@@ -254,18 +279,6 @@ class FlowActorCriticPolicy(ActorCriticPolicy):
         )
 
 
-def read_critic(reader: Reader, policy: FlowActorCriticPolicy) -> Perceptron | None:
-    """The critic behind the features, or None if it is not of the kind that kernels know."""
-    reader.children(policy)
-    if type(policy.mlp_extractor) is not MlpExtractor or not reader.is_plain(policy.mlp_extractor):
-        return None
-    reader.children(policy.mlp_extractor)
-    hidden = policy.mlp_extractor.value_net
-    if not reader.is_plain(hidden):
-        return None
-    return reader.perceptron((*reader.children(hidden), policy.value_net))
-
-
 def is_in_mode(module: nn.Module, mode: bool) -> bool:
     """Whether a module and all modules within it are in training mode, or in evaluation mode."""
     if module.training is not mode:
@@ -273,24 +286,19 @@ def is_in_mode(module: nn.Module, mode: bool) -> bool:
     return all(is_in_mode(child, mode) for child in module._modules.values() if child is not None)
 
 
-def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
-    """Refuse what a flow policy cannot do.
+def policy_aliases(
+    mlp: type[FlowPolicy], cnn: type[FlowPolicy], multi_input: type[FlowPolicy]
+) -> dict[str, type[BasePolicy]]:
+    """An algorithm's policies by the names of flow policies and by those of SB3."""
+    return {
+        "MlpFlowPolicy": mlp,
+        "CnnFlowPolicy": cnn,
+        "MultiInputFlowPolicy": multi_input,
+        "MlpPolicy": mlp,
+        "CnnPolicy": cnn,
+        "MultiInputPolicy": multi_input,
+    }
 
-    :raises ValueError: If the actions are not continuous or not floats, or gSDE is asked for.
-    """
-    if not isinstance(action_space, spaces.Box):
-        raise ValueError(
-            f"Flow policies need continuous actions (a Box), but the action space is "
-            f"{action_space}: use PPO of stable_baselines3 for it."
-        )
-    if not np.issubdtype(action_space.dtype, np.floating):
-        raise ValueError(
-            f"Flow policies draw real numbers, but the actions are {action_space.dtype}: declare a "
-            "Box of np.float32, and round in the environment (gymnasium.wrappers.TransformAction)."
-        )
-    if use_sde:
-        raise ValueError(
-            "Flow policies draw their own exploration noise, so use_sde=True is not supported: "
-            "leave it out. The noise has options of its own, such as PolicyFlow's "
-            "policy_kwargs=dict(log_std_init=...)."
-        )
+
+FlowActorCriticPolicy = FlowPolicy
+"""Deprecated alias of :class:`FlowPolicy`."""

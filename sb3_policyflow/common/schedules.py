@@ -1,9 +1,13 @@
-"""Coefficients that change while training goes on."""
+"""Coefficients and learning rates that change during training."""
 
 import re
+from dataclasses import dataclass
+from typing import Any
 
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from sb3_policyflow.common import checks
 
 Coefficient = float | str | Schedule
 """A constant, a string such as "lin_0.25", or a function of the remaining progress."""
@@ -11,7 +15,7 @@ Coefficient = float | str | Schedule
 _LINEAR = re.compile(r"lin_(?P<start>[^_]+)(_(?P<end>[^_]+))?")
 
 
-def parse_schedule(name: str, value: Coefficient) -> FloatSchedule:
+def parse_schedule(name: str, value: object) -> FloatSchedule:
     """Turn what the user gave for a coefficient into a function of the remaining progress.
 
     >>> parse_schedule("brownian_coef", "lin_0.25")(0.5)
@@ -35,7 +39,7 @@ def parse_schedule(name: str, value: Coefficient) -> FloatSchedule:
     return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
 
 
-def _ends(name: str, value: float | str) -> tuple[float, float]:
+def _ends(name: str, value: Any) -> tuple[float, float]:
     """First and last value of a constant or linear schedule."""
     try:
         linear = _LINEAR.fullmatch(value) if isinstance(value, str) else None
@@ -47,3 +51,67 @@ def _ends(name: str, value: float | str) -> tuple[float, float]:
             f"{name} must be a number, a string such as 'lin_0.25' or 'lin_0.25_0.05', or a "
             f"function of the remaining progress, got {value!r}."
         ) from None
+
+
+@dataclass(frozen=True)
+class KLAdaptiveLearningRate:
+    """Lowers the learning rate when the policy changes too much and raises it when too little.
+
+    lr / factor if KL > margin * target,    lr * factor if KL < target / margin
+
+    The rule of RSL-RL and skrl, on which the paper builds.
+
+    >>> rule = KLAdaptiveLearningRate()
+    >>> [round(rule.adapt(3e-4, kl, desired_kl=0.01), 7) for kl in (0.03, 0.01, 0.001)]
+    [0.0002, 0.0003, 0.00045]
+
+    :param interval: When the learning rate moves: after each "epoch" or "minibatch".
+    :param window: Whether the divergence at the end of an epoch is the mean over this "epoch" or
+        over the "update" so far.
+    :param factor: Factor by which the learning rate moves, greater than 1.
+    :param margin: Factor by which the divergence may miss the target before the rate moves.
+    :param bounds: Lowest and highest learning rate. A start outside the bounds is kept and may only
+        move towards them.
+    :raises ValueError: If a parameter is out of its range.
+    """
+
+    interval: str = "epoch"
+    window: str = "epoch"
+    factor: float = 1.5
+    margin: float = 2.0
+    bounds: tuple[float, float] = (1e-6, 1e-2)
+
+    def __post_init__(self) -> None:
+        checks.one_of(("epoch", "minibatch"))("interval", self.interval)
+        checks.one_of(("epoch", "update"))("window", self.window)
+        checks.between(1)("margin", self.margin)
+        checks.positive("factor", self.factor)
+        checks.bounds("bounds", self.bounds)
+        if self.factor <= 1:
+            raise ValueError(f"factor must be greater than 1, got {self.factor}.")
+        if self.bounds[0] <= 0:
+            raise ValueError(f"bounds must be positive, got {self.bounds}.")
+
+    @classmethod
+    def of(cls, name: str, options: Any) -> "KLAdaptiveLearningRate":
+        """The rule with these options.
+
+        :param name: What the options are called, for error messages.
+        :param options: A dictionary of the parameters, or None for the defaults.
+        :raises ValueError: If an option is unknown or cannot be used.
+        """
+        try:
+            return cls(**(options or {}))
+        except TypeError as error:
+            known = ", ".join(cls.__dataclass_fields__)
+            raise ValueError(f"{name} must be a dictionary of {known}, got {options!r}.") from error
+
+    def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
+        """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""
+        # Where it starts beyond its bounds, they must not turn "lower" into "higher".
+        lowest, highest = min(self.bounds[0], learning_rate), max(self.bounds[1], learning_rate)
+        if kl > self.margin * desired_kl:
+            return max(learning_rate / self.factor, lowest)
+        if kl < desired_kl / self.margin:
+            return min(learning_rate * self.factor, highest)
+        return learning_rate

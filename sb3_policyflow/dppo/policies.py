@@ -1,5 +1,6 @@
 """Policies of DPPO: an action is the end of a chain of Gaussian steps."""
 
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
 
@@ -7,17 +8,26 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import (
-    check_choice,
-    check_count,
-    check_positive,
-    check_positive_or_none,
-)
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.options import FlowOptions
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
+
+
+class DPPOOptions(FlowOptions, total=False):
+    """The shared options, and those of the policy."""
+
+    process: str
+    n_denoising_steps: int
+    n_finetuned_steps: int | None
+    min_sampling_std: float
+    min_log_prob_std: float
+    noise_clip: float | None
+    denoised_clip: float
+    identity_skip: bool
 
 
 class DPPORecord(NamedTuple):
@@ -31,20 +41,20 @@ class DPPORecord(NamedTuple):
     means: th.Tensor
 
 
-class DPPOPolicy(FlowActorCriticPolicy):
+class DPPOPolicy(FlowPolicy):
     """Actor-critic policy that denoises an action in several steps.
 
-    x_0 ~ N(0, I),    x_{k+1} ~ N(m_k(x_k, s), max(s_k, min_sampling_std)^2 I),    a = x_K
+    x_0 ~ N(0, I),    x_{k+1} ~ N(m_k(x_k, s), max(s_k, s_min)^2 I),    a = x_K
 
     With "ddpm", the chain's end lies in [-1, 1], which is scaled to the action space.
 
-    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
+    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
     :param process: "ddpm", or "flow" for Euler steps with noise of a fixed standard deviation.
     :param n_denoising_steps: K, steps from noise to action.
     :param n_finetuned_steps: How many of them, the last ones, are trained; the others belong to a
         frozen copy of the networks, see :meth:`freeze_base`. All if None.
-    :param min_sampling_std: Least standard deviation of a step.
+    :param min_sampling_std: s_min, least standard deviation of a step.
     :param min_log_prob_std: Least standard deviation that the likelihood of a step is taken with.
     :param noise_clip: Bound of a step's noise, in its standard deviations; None for none.
     :param denoised_clip: Bound of the action that "ddpm" predicts in each step.
@@ -53,16 +63,15 @@ class DPPOPolicy(FlowActorCriticPolicy):
     :raises ValueError: If an option is not supported.
     """
 
-    own_parameters: ClassVar[tuple[str, ...]] = (
-        *FlowActorCriticPolicy.own_parameters,
-        "n_denoising_steps",
-        "n_finetuned_steps",
-        "min_sampling_std",
-        "min_log_prob_std",
-        "noise_clip",
-        "denoised_clip",
-        "identity_skip",
-    )
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "process": checks.one_of(("ddpm", "flow")),
+        "n_denoising_steps": checks.at_least(1),
+        "n_finetuned_steps": checks.or_none(checks.at_least(1)),
+        "min_sampling_std": checks.positive,
+        "min_log_prob_std": checks.positive,
+        "noise_clip": checks.positive_or_none,
+        "denoised_clip": checks.positive,
+    }
 
     def __init__(
         self,
@@ -80,7 +89,7 @@ class DPPOPolicy(FlowActorCriticPolicy):
         identity_skip: bool = True,
         **kwargs: Any,
     ) -> None:
-        self.process_name = process
+        self.process = process
         self.n_denoising_steps = n_denoising_steps
         self.n_finetuned_steps = n_finetuned_steps
         self.min_sampling_std = min_sampling_std
@@ -88,41 +97,32 @@ class DPPOPolicy(FlowActorCriticPolicy):
         self.noise_clip = noise_clip
         self.denoised_clip = denoised_clip
         self.identity_skip = identity_skip
-        self._check_options()
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         # SB3 then scales the actions from [-1, 1] to their space.
         self._squash_output = process == "ddpm"
 
-    def _check_options(self) -> None:
-        check_choice("process", self.process_name, ("ddpm", "flow"))
-        check_count("n_denoising_steps", self.n_denoising_steps, 1)
-        if self.n_finetuned_steps is not None:
-            check_count("n_finetuned_steps", self.n_finetuned_steps, 1)
-            if self.n_finetuned_steps > self.n_denoising_steps:
-                raise ValueError(
-                    "n_finetuned_steps must be some of the n_denoising_steps="
-                    f"{self.n_denoising_steps}, got {self.n_finetuned_steps}."
-                )
-        for name in ("min_sampling_std", "min_log_prob_std", "denoised_clip"):
-            check_positive(name, getattr(self, name))
-        check_positive_or_none("noise_clip", self.noise_clip)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "process": self.process_name}
-
     def _build_actor(self) -> None:
-        super()._build_actor()
-        self.process: DenoisingProcess
-        if self.process_name == "ddpm":
-            self.process = DDPM(self.n_denoising_steps, self.denoised_clip, self.identity_skip)
-        else:
-            self.process = EulerChain(self.n_denoising_steps)
+        self.velocity = self._make_velocity_field()
         n_trained = self.n_finetuned_steps or self.n_denoising_steps
         self.n_frozen_steps = self.n_denoising_steps - n_trained
+        if self.n_frozen_steps < 0:
+            raise ValueError(
+                "n_finetuned_steps must be some of the n_denoising_steps="
+                f"{self.n_denoising_steps}, got {self.n_finetuned_steps}."
+            )
+        self.chain: DenoisingProcess
+        if self.process == "ddpm":
+            self.chain = DDPM(self.n_denoising_steps, self.denoised_clip, self.identity_skip)
+        else:
+            self.chain = EulerChain(self.n_denoising_steps)
         if self.n_frozen_steps > 0:
             self.base_velocity = deepcopy(self.velocity).requires_grad_(False)
             self.base_features_extractor = deepcopy(self.pi_features_extractor)
             self.base_features_extractor.requires_grad_(False)
+
+    @property
+    def n_evaluations_per_action(self) -> int:
+        return self.n_denoising_steps
 
     def freeze_base(self) -> None:
         """Let the steps that are not trained use the networks as they are now, say after imitation.
@@ -161,7 +161,7 @@ class DPPOPolicy(FlowActorCriticPolicy):
     @property
     def log_prob_stds(self) -> th.Tensor:
         """Standard deviations that likelihoods of the trained steps are taken with, shape (k,)."""
-        return self.process.stds[self.n_frozen_steps :].clamp(min=self.min_log_prob_std)
+        return self.chain.stds[self.n_frozen_steps :].clamp(min=self.min_log_prob_std)
 
     def trained_means(self, points: th.Tensor, features: th.Tensor) -> th.Tensor:
         """Means of the trained steps.
@@ -178,9 +178,7 @@ class DPPOPolicy(FlowActorCriticPolicy):
         if self._has_base_features:
             trained, base = features.tensor_split(2, dim=-1)
             features = base if is_frozen else trained
-        return self.process.means(
-            points, network(points, self.process.times[steps], features), steps
-        )
+        return self.chain.means(points, network(points, self.chain.times[steps], features), steps)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
@@ -194,8 +192,8 @@ class DPPOPolicy(FlowActorCriticPolicy):
         )
         return self._bounded(points[-1]), record
 
-    def carry(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """Carry latents x_0 along the means of all steps, see :class:`FlowActorCriticPolicy`."""
+    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """Transport latents x_0 along the means of all steps, see :meth:`FlowPolicy.transport`."""
         points, _ = self._chain(latents, features, is_noisy=False)
         return self._bounded(points[-1])
 
@@ -204,7 +202,7 @@ class DPPOPolicy(FlowActorCriticPolicy):
     ) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """The K + 1 points of a chain, and the K means around which all but the first lie."""
         points, means = [latents], list[th.Tensor]()
-        stds = self.process.stds.clamp(min=self.min_sampling_std)
+        stds = self.chain.stds.clamp(min=self.min_sampling_std)
         for step in range(self.n_denoising_steps):
             means.append(self._means(points[-1], step, features))
             points.append(self._noisy(means[-1], stds[step]) if is_noisy else means[-1])
@@ -229,9 +227,13 @@ class DPPOPolicy(FlowActorCriticPolicy):
 MlpFlowPolicy = DPPOPolicy
 
 
-class CnnFlowPolicy(ImageFeatures, DPPOPolicy):
-    """:class:`DPPOPolicy` for images: its default features extractor is SB3's ``NatureCNN``."""
+class CnnFlowPolicy(DPPOPolicy):
+    """:class:`DPPOPolicy` for images: its default features extractor is ``NatureCNN``."""
+
+    default_features_extractor_class = NatureCNN
 
 
-class MultiInputFlowPolicy(DictFeatures, DPPOPolicy):
-    """:class:`DPPOPolicy` for Dict observations, by default with SB3's ``CombinedExtractor``."""
+class MultiInputFlowPolicy(DPPOPolicy):
+    """:class:`DPPOPolicy` for Dict observations, by default with ``CombinedExtractor``."""
+
+    default_features_extractor_class = CombinedExtractor

@@ -6,7 +6,7 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def choose(what: str, name: str, choices: Mapping[str, T]) -> T:
+def choose(option: str, name: object, choices: Mapping[str, T]) -> T:
     """Look ``name`` up among ``choices``.
 
     >>> choose("solver", "euler", {"euler": 1, "heun": 2})
@@ -14,16 +14,15 @@ def choose(what: str, name: str, choices: Mapping[str, T]) -> T:
     >>> choose("solver", "newton", {"euler": 1, "heun": 2})
     Traceback (most recent call last):
     ...
-    ValueError: Unknown solver 'newton': choose one of 'euler', 'heun'.
+    ValueError: solver must be one of 'euler', 'heun', got 'newton'.
 
-    :param what: What is being chosen, for the error message.
+    :param option: The option that is being chosen, for the error message.
     :param name: The name that the user gave.
-    :param choices: What there is, by name.
+    :param choices: The choices, by name.
     :return: The choice of that name.
     :raises ValueError: If there is none of that name.
     """
-    try:
-        return choices[name]
-    except (KeyError, TypeError):
+    if not isinstance(name, str) or name not in choices:
         known = ", ".join(repr(choice) for choice in choices)
-        raise ValueError(f"Unknown {what} {name!r}: choose one of {known}.") from None
+        raise ValueError(f"{option} must be one of {known}, got {name!r}.")
+    return choices[name]

@@ -1,22 +1,40 @@
-"""The first layer of a velocity field, taken apart: exact algebra that saves most of its work.
+"""The first layer of a velocity field, split into its three summands, which saves most of its work.
 
 W [x, t_emb(t) + W_o s + b_o] + b = W_x x + (W_e t_emb(t) + W_e b_o + b) + (W_e W_o) s
 
 The middle term depends on time alone: a solver sees few times and needs a small table. The last
-depends on the observation alone: it is the same for every time.
+depends on the observation alone: it is computed once for all times.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch as th
 from torch import nn
 
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.solvers import SOLVERS, solver_times
-from sb3_policyflow.flows.velocity import VelocityField
+
+if TYPE_CHECKING:  # that module imports this one
+    from sb3_policyflow.flows.velocity import VelocityField
+
+HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+"""Attributes of a module that hold its hooks, by name; torch has no public way to ask for them."""
 
 
-class FirstLayer(NamedTuple):
+def has_hooks(module: nn.Module) -> bool:
+    """Whether anything takes part in a module's call beside the ``forward`` of its class.
+
+    Hooks are how pruning, weight normalization and those who watch activations take part.
+
+    >>> layer = nn.Linear(1, 1)
+    >>> handle = layer.register_forward_hook(print)
+    >>> has_hooks(layer), has_hooks(nn.Linear(1, 1))
+    (True, False)
+    """
+    return "forward" in vars(module) or any(getattr(module, name) for name in HOOKS)
+
+
+class FoldedLayer(NamedTuple):
     """What points, features and times contribute to the first layer of h outputs.
 
     ``points`` W_x, shape (h, dim); ``features`` W_e W_o, shape (h, features_dim); ``table``, a row
@@ -28,8 +46,16 @@ class FirstLayer(NamedTuple):
     table: th.Tensor
 
 
-def fold(field: VelocityField, times: th.Tensor) -> FirstLayer:
-    """Take the first layer apart; differentiable.
+def is_foldable(field: "VelocityField") -> bool:
+    """Whether the first layer of a field is plainly linear, and can be split."""
+    first, observation = field.layers[0], field.observation_embedding
+    is_linear = type(first) is nn.Linear and type(observation) is nn.Linear
+    is_watched = has_hooks(field) or has_hooks(first) or has_hooks(observation)
+    return field.has_formula_of_paper and is_linear and not is_watched
+
+
+def fold(field: "VelocityField", times: th.Tensor) -> FoldedLayer:
+    """Split the first layer; differentiable.
 
     :param field: The velocity field.
     :param times: Times for the table, shape (n_times,).
@@ -40,7 +66,7 @@ def fold(field: VelocityField, times: th.Tensor) -> FirstLayer:
     of_points, of_embedding = first.weight[:, :dim], first.weight[:, dim:]
     observation = field.observation_embedding
     embeddings = field.time_embedding(times) + observation.bias
-    return FirstLayer(
+    return FoldedLayer(
         of_points,
         of_embedding @ observation.weight,
         nn.functional.linear(embeddings, of_embedding, first.bias),
@@ -48,7 +74,7 @@ def fold(field: VelocityField, times: th.Tensor) -> FirstLayer:
 
 
 def integrate_folded(
-    field: VelocityField,
+    field: "VelocityField",
     latents: th.Tensor,
     features: th.Tensor,
     *,
@@ -56,13 +82,14 @@ def integrate_folded(
     solver: str,
     end_time: float = 1.0,
 ) -> th.Tensor:
-    """What ``integrate`` yields for a velocity field, with its first layer taken apart.
+    """What ``integrate`` yields for a velocity field, with its first layer split.
 
+    >>> from sb3_policyflow.flows import VelocityField
     >>> field, z, s = VelocityField(2, 3, [16]), th.randn(5, 2), th.randn(5, 3)
     >>> integrate_folded(field, z, s, n_steps=4, solver="heun").shape
     torch.Size([5, 2])
 
-    :param field: The velocity field.
+    :param field: The velocity field, see :func:`is_foldable`.
     :param latents: z, shape (..., dim).
     :param features: s, shape (..., features_dim).
     :param n_steps: Number of equal steps.

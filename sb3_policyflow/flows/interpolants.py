@@ -1,7 +1,7 @@
-"""Interpolation paths between a latent and an end point (paper, table of interpolation paths).
+"""Interpolants between a latent and an end point (paper, table of interpolation paths).
 
-A path says where between z and phi the velocity is looked at, and how the score of the points on
-it follows from the velocity.
+An interpolant defines the points x_t between z and phi at which velocities are compared, and how
+the score of these points follows from the velocity.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch as th
 
 
-class PathCoefficients(NamedTuple):
+class InterpolantCoefficients(NamedTuple):
     """Coefficients of x_t = latent z + endpoint phi + noise h, each of the shape of the times."""
 
     latent: th.Tensor
@@ -27,18 +27,18 @@ class ScoreCoefficients(NamedTuple):
     point: th.Tensor
 
 
-class Path(ABC):
+class Interpolant(ABC):
     """How x_t goes from a latent at t = 0 to an end point at t = ``end_time``."""
 
     end_time: float = 1.0
     stochastic: bool = False
 
     @abstractmethod
-    def coefficients(self, times: th.Tensor) -> PathCoefficients:
+    def coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
         """Coefficients of x_t at each time."""
 
     @abstractmethod
-    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+    def derivative_coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
         """Coefficients of dx_t/dt at each time."""
 
     @abstractmethod
@@ -57,7 +57,8 @@ class Path(ABC):
         :param latents: z, shape (..., dim).
         :param endpoints: phi, shape (..., dim).
         :param times: t, shape (...), which broadcasts with the leading shape of the others.
-        :param noise: h ~ N(0, I), for stochastic paths; drawn if not given. Others ignore it.
+        :param noise: h ~ N(0, I), for stochastic interpolants, drawn if not given; others ignore
+            it.
         :return: x_t, shape (..., dim).
         """
         return self._combine(self.coefficients(times), latents, endpoints, noise)
@@ -69,7 +70,7 @@ class Path(ABC):
         times: th.Tensor,
         noise: th.Tensor | None = None,
     ) -> th.Tensor:
-        """Velocity dx_t/dt of the points on the path, the target of flow matching.
+        """Velocity dx_t/dt of the interpolant, the target of flow matching.
 
         Takes and returns the shapes of :meth:`interpolate`.
         """
@@ -78,36 +79,38 @@ class Path(ABC):
     def brownian_residual(
         self,
         velocity: th.Tensor,
-        old_velocity: th.Tensor,
+        reference_velocity: th.Tensor,
         points: th.Tensor,
         times: th.Tensor,
         latent_std: float = 1.0,
     ) -> th.Tensor:
         """How far a velocity is from minus the score of the reference flow (paper, eta_t).
 
-        eta = c(t) (v + grad log p_t), with the score taken from the reference velocity:
-        eta = c(t) v - (b(t) x_t - a(t) v_old),    c score = a v_old - b x_t
+        eta = c(t) (v + grad log p_t), where the score follows from the reference velocity v_ref:
+        eta = c(t) v - (b(t) x_t - a(t) v_ref),    c score = a v_ref - b x_t
 
-        Latents of standard deviation s have a v_old - b x_t = c s^2 score on paths without noise of
-        their own, since the score is -E[z | x_t] over s^2 and the coefficient of z.
+        With latents of standard deviation s, a v_ref - b x_t = c s^2 score for interpolants without
+        noise of their own, since the score is -E[z | x_t] over s^2 and the coefficient of z.
 
         >>> t, x, v = th.tensor([0.25]), th.tensor([[2.0]]), th.tensor([[4.0]])
         >>> Rectified().brownian_residual(v, v, x, t).item()  # 0.75 * 4 - (2 - 0.25 * 4)
         2.0
 
         :param velocity: v, shape (..., dim).
-        :param old_velocity: v_old, the reference velocity at the same points, shape (..., dim).
+        :param reference_velocity: v_ref, that of the reference policy at the same points,
+            shape (..., dim).
         :param points: x_t, shape (..., dim).
         :param times: t, shape (...).
-        :param latent_std: s, of z ~ N(0, s^2); 1 for stochastic paths.
+        :param latent_std: s, of z ~ N(0, s^2); 1 for stochastic interpolants.
         :return: eta, shape (..., dim).
         """
-        score, slope, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))
-        return score * velocity - (point * points - slope * old_velocity) / latent_std**2
+        score, velocity_coef, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))
+        score_term = (point * points - velocity_coef * reference_velocity) / latent_std**2
+        return score * velocity - score_term
 
     def _combine(
         self,
-        coefficients: PathCoefficients,
+        coefficients: InterpolantCoefficients,
         latents: th.Tensor,
         endpoints: th.Tensor,
         noise: th.Tensor | None,
@@ -119,58 +122,65 @@ class Path(ABC):
         return points + spread * (th.randn_like(points) if noise is None else noise)
 
 
-class Rectified(Path):
+class Rectified(Interpolant):
     """The straight path of rectified flow.
 
     x_t = (1 - t) z + t phi,    (1 - t) grad log p_t = t v_t - x
     """
 
-    def coefficients(self, times: th.Tensor) -> PathCoefficients:
-        return PathCoefficients(1 - times, times, th.zeros_like(times))
+    def coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
+        return InterpolantCoefficients(1 - times, times, th.zeros_like(times))
 
-    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+    def derivative_coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
         ones = th.ones_like(times)
-        return PathCoefficients(-ones, ones, th.zeros_like(times))
+        return InterpolantCoefficients(-ones, ones, th.zeros_like(times))
 
     def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
         return ScoreCoefficients(1 - times, times, th.ones_like(times))
 
 
-class StochasticInterpolant(Path):
-    """A straight path with noise around its middle.
+class _NoisyLine(Interpolant):
+    """A straight path with noise that is greatest in its middle.
 
-    x_t = (1 - t) z + t phi + sqrt(2 t (1 - t)) h,
-    (2 (t - 1/2)^2 + 1/2) grad log p_t ~ t v_t - x: an approximation (paper, appendix on the
-    relation between score and velocity for stochastic interpolants).
+    x_t = (1 - t) z + t phi + sqrt(2 t (1 - t)) h
     """
 
     stochastic = True
 
-    def coefficients(self, times: th.Tensor) -> PathCoefficients:
-        return PathCoefficients(1 - times, times, (2 * times * (1 - times)).sqrt())
+    def coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
+        return InterpolantCoefficients(1 - times, times, (2 * times * (1 - times)).sqrt())
 
-    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
+    def derivative_coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
         """Coefficients of dx_t/dt; the noise's is infinite at both end points."""
         ones = th.ones_like(times)
-        return PathCoefficients(-ones, ones, (1 - 2 * times) / (2 * times * (1 - times)).sqrt())
+        noise = (1 - 2 * times) / (2 * times * (1 - times)).sqrt()
+        return InterpolantCoefficients(-ones, ones, noise)
+
+
+class StochasticInterpolant(_NoisyLine):
+    """The paper's stochastic interpolant: x_t = (1 - t) z + t phi + sqrt(2 t (1 - t)) h.
+
+    (2 (t - 1/2)^2 + 1/2) grad log p_t ~ t v_t - x: an approximation (paper, appendix on the
+    relation between score and velocity for stochastic interpolants).
+    """
 
     def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
         return ScoreCoefficients(2 * (times - 0.5) ** 2 + 0.5, times, th.ones_like(times))
 
 
-class ExactStochasticInterpolant(StochasticInterpolant):
-    """The stochastic interpolant with the relation that holds for Gaussian latents.
+class ExactStochasticInterpolant(_NoisyLine):
+    """The stochastic interpolant with the score relation that holds exactly for Gaussian latents.
 
     Latent and noise together are Gaussian of variance (1 - t)^2 + 2 t (1 - t) = 1 - t^2, so that
     x_t = t phi + sqrt(1 - t^2) e and grad log p_t = t v_t - x, whatever the end points. The paper's
-    coefficient lacks 2 t (1 - t) of it.
+    coefficient is smaller by 2 t (1 - t).
     """
 
     def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
         return ScoreCoefficients(th.ones_like(times), times, th.ones_like(times))
 
 
-class TrigFlow(Path):
+class TrigFlow(Interpolant):
     """The path along a quarter of a circle.
 
     x_t = cos(t) z + sin(t) phi,    cos(t) grad log p_t = sin(t) v_t - cos(t) x,    0 <= t <= pi/2
@@ -178,19 +188,25 @@ class TrigFlow(Path):
 
     end_time = math.pi / 2
 
-    def coefficients(self, times: th.Tensor) -> PathCoefficients:
-        return PathCoefficients(times.cos(), times.sin(), th.zeros_like(times))
+    def coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
+        return InterpolantCoefficients(times.cos(), times.sin(), th.zeros_like(times))
 
-    def derivative_coefficients(self, times: th.Tensor) -> PathCoefficients:
-        return PathCoefficients(-times.sin(), times.cos(), th.zeros_like(times))
+    def derivative_coefficients(self, times: th.Tensor) -> InterpolantCoefficients:
+        return InterpolantCoefficients(-times.sin(), times.cos(), th.zeros_like(times))
 
     def score_coefficients(self, times: th.Tensor) -> ScoreCoefficients:
         return ScoreCoefficients(times.cos(), times.sin(), times.cos())
 
 
-PATHS: dict[str, type[Path]] = {
+INTERPOLANTS: dict[str, type[Interpolant]] = {
     "rectified": Rectified,
     "stochastic": StochasticInterpolant,
     "stochastic_exact": ExactStochasticInterpolant,
     "trigflow": TrigFlow,
 }
+"""Interpolants by their names."""
+
+Path = Interpolant
+"""Deprecated alias of :class:`Interpolant`."""
+PATHS = INTERPOLANTS
+"""Deprecated alias of :data:`INTERPOLANTS`."""

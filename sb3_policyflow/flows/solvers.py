@@ -24,26 +24,28 @@ class Solver(Protocol):
         """p: halving the step divides the error at the end by 2^p."""
 
     @property
-    def evaluations(self) -> int:
-        """Velocity evaluations in each step."""
+    def n_stages(self) -> int:
+        """Evaluations of the velocity in each step."""
 
     @property
-    def subdivisions(self) -> int:
-        """Parts into which the evaluation times divide a step."""
+    def grid_points_per_step(self) -> int:
+        """Points of the time grid in each step, its end not counted: where the velocity is seen."""
 
     def solve(
         self,
         velocity: Velocity,
         points: th.Tensor,
         times: th.Tensor,
-        labels: th.Tensor | None = None,
+        time_inputs: th.Tensor | None = None,
     ) -> th.Tensor:
         """Carry ``points`` from the first to the last of ``times``.
 
         :param velocity: The field ``velocity(points, time)``.
         :param points: Where the flow starts, shape (..., dim).
         :param times: The solver's times, shape (n,).
-        :param labels: What the field is given in place of each time, shape (n, ...).
+        :param time_inputs: What the field is given in place of each time, such as a row of a table
+            of embeddings, shape (n, ...); the times themselves if not given.
+        :return: End points, of the shape of ``points``.
         """
 
 
@@ -60,12 +62,12 @@ class RungeKutta:
     weights: tuple[float, ...]
 
     @property
-    def evaluations(self) -> int:
-        """Velocity evaluations in each step."""
+    def n_stages(self) -> int:
+        """Evaluations of the velocity in each step."""
         return len(self.nodes)
 
     @property
-    def subdivisions(self) -> int:
+    def grid_points_per_step(self) -> int:
         """2 if the velocity is also evaluated in the middle of a step, 1 otherwise."""
         return 2 if 0.5 in self.nodes else 1
 
@@ -74,24 +76,24 @@ class RungeKutta:
         velocity: Velocity,
         points: th.Tensor,
         times: th.Tensor,
-        labels: th.Tensor | None = None,
+        time_inputs: th.Tensor | None = None,
     ) -> th.Tensor:
-        """Carry ``points`` from the first to the last of ``times``, ``subdivisions`` to a step."""
-        labels = times if labels is None else labels
-        n_parts = self.subdivisions
+        """Carry ``points`` from the first to the last of ``times``; see :class:`Solver`."""
+        time_inputs = times if time_inputs is None else time_inputs
+        n_parts = self.grid_points_per_step
         for start in range(0, len(times) - 1, n_parts):
             step = times[start + n_parts] - times[start]
-            points = self._step(velocity, points, step, labels[start : start + n_parts + 1])
+            points = self._step(velocity, points, step, time_inputs[start : start + n_parts + 1])
         return points
 
     def _step(
-        self, velocity: Velocity, points: th.Tensor, step: th.Tensor, labels: th.Tensor
+        self, velocity: Velocity, points: th.Tensor, step: th.Tensor, time_inputs: th.Tensor
     ) -> th.Tensor:
-        slopes: list[th.Tensor] = []
+        stages: list[th.Tensor] = []
         for node, row in zip(self.nodes, self.matrix, strict=True):
-            label = labels[round(node * self.subdivisions)]
-            slopes.append(velocity(points + step * _weighted_sum(row, slopes), label))
-        return points + step * _weighted_sum(self.weights, slopes)
+            time_input = time_inputs[round(node * self.grid_points_per_step)]
+            stages.append(velocity(points + step * _weighted_sum(row, stages), time_input))
+        return points + step * _weighted_sum(self.weights, stages)
 
 
 @dataclass(frozen=True)
@@ -102,30 +104,30 @@ class AdamsBashforth2:
     """
 
     order: int = 2
-    evaluations: int = 1
-    subdivisions: int = 1
+    n_stages: int = 1
+    grid_points_per_step: int = 1
 
     def solve(
         self,
         velocity: Velocity,
         points: th.Tensor,
         times: th.Tensor,
-        labels: th.Tensor | None = None,
+        time_inputs: th.Tensor | None = None,
     ) -> th.Tensor:
-        """Carry ``points`` from the first to the last of ``times``."""
-        labels = times if labels is None else labels
+        """Carry ``points`` from the first to the last of ``times``; see :class:`Solver`."""
+        time_inputs = times if time_inputs is None else time_inputs
         previous: th.Tensor | None = None
-        for (time, next_time), label in zip(pairwise(times), labels[:-1], strict=True):
-            slope = velocity(points, label)
-            change = slope if previous is None else 1.5 * slope - 0.5 * previous
+        for (time, next_time), time_input in zip(pairwise(times), time_inputs[:-1], strict=True):
+            stage = velocity(points, time_input)
+            change = stage if previous is None else 1.5 * stage - 0.5 * previous
             points = points + (next_time - time) * change
-            previous = slope
+            previous = stage
         return points
 
 
-def _weighted_sum(weights: tuple[float, ...], slopes: list[th.Tensor]) -> th.Tensor | float:
-    """Sum of weight times slope, over the weights that are not zero."""
-    terms = [w * k for w, k in zip(weights, slopes, strict=True) if w != 0.0]
+def _weighted_sum(weights: tuple[float, ...], stages: list[th.Tensor]) -> th.Tensor | float:
+    """Sum of weight times stage, over the weights that are not zero."""
+    terms = [w * k for w, k in zip(weights, stages, strict=True) if w != 0.0]
     return sum(terms[1:], start=terms[0]) if terms else 0.0
 
 
@@ -152,12 +154,12 @@ def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
     :param solver: Name of the solver.
     :param n_steps: Number of equal steps, at least 1.
     :param end_time: Where the integration ends.
-    :return: Times in increasing order, float64, shape (n_steps * subdivisions + 1,).
+    :return: Times in increasing order, float64, shape (n_steps * grid_points_per_step + 1,).
     :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
     """
     if n_steps < 1:
         raise ValueError(f"A flow needs at least one solver step, got n_flow_steps={n_steps}.")
-    n_parts = choose("solver", solver, SOLVERS).subdivisions * n_steps
+    n_parts = choose("solver", solver, SOLVERS).grid_points_per_step * n_steps
     return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64)
 
 

@@ -1,4 +1,4 @@
-"""Where along the path the update looks (paper, sensitivity to the time sampling strategy)."""
+"""Times at which velocities are compared (paper, sensitivity to the time sampling strategy)."""
 
 from typing import Protocol
 
@@ -31,10 +31,10 @@ class GridTimes:
         return self.grid[th.randint(len(self.grid), size, device=self.grid.device)]
 
 
-class StartTimes(GridTimes):
-    """Times drawn uniformly from a grid without its end; with Euler, those at which steps start.
+class GridTimesWithoutEnd(GridTimes):
+    """Times drawn uniformly from a grid without its end: for Euler, those at which steps start.
 
-    >>> times = StartTimes(th.tensor([0.0, 0.5, 1.0])).sample(100, 1)
+    >>> times = GridTimesWithoutEnd(th.tensor([0.0, 0.5, 1.0])).sample(100, 1)
     >>> sorted(set(times.flatten().tolist()))
     [0.0, 0.5]
     """
@@ -64,6 +64,10 @@ class UniformTimes:
 
 TIME_SAMPLERS: dict[str, type[GridTimes | UniformTimes]] = {
     "grid": GridTimes,
-    "starts": StartTimes,
+    "grid_without_end": GridTimesWithoutEnd,
     "uniform": UniformTimes,
 }
+"""Time samplers by their names."""
+
+StartTimes = GridTimesWithoutEnd
+"""Deprecated alias of :class:`GridTimesWithoutEnd`."""

@@ -4,11 +4,14 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from numbers import Integral
+from typing import ClassVar
 
 import torch as th
 from torch import nn
 
 from sb3_policyflow.flows.choices import choose
+from sb3_policyflow.flows.folding import integrate_folded, is_foldable
+from sb3_policyflow.flows.solvers import integrate
 
 
 class FourierTimeEmbedding(nn.Module):
@@ -86,6 +89,14 @@ class VelocityField(nn.Module):
     :raises ValueError: If the initialization is unknown or the embedding is empty.
     """
 
+    has_formula_of_paper: ClassVar[bool] = True
+    """Whether :meth:`forward` is the formula above, so that its first layer may be split."""
+
+    def __init_subclass__(cls, has_formula_of_paper: bool = False) -> None:
+        # A subclass may have any velocity: that it has the paper's, it must say itself.
+        super().__init_subclass__()
+        cls.has_formula_of_paper = has_formula_of_paper
+
     def __init__(
         self,
         dim: int,
@@ -126,6 +137,43 @@ class VelocityField(nn.Module):
         embedding = embedding.expand(*points.shape[:-1], embedding.shape[-1])
         velocity: th.Tensor = self.output(self.hidden(th.cat([points, embedding], dim=-1)))
         return velocity
+
+    def integrate(
+        self,
+        latents: th.Tensor,
+        features: th.Tensor,
+        *,
+        solver: str,
+        n_steps: int,
+        end_time: float = 1.0,
+    ) -> th.Tensor:
+        """Carry latents along the flow to its end points (paper, flow ODE).
+
+        The first layer is split where it is plainly linear, see :mod:`~.folding`.
+
+        >>> field, z, s = VelocityField(2, 3, [16]), th.randn(5, 2), th.randn(5, 3)
+        >>> field.integrate(z, s, solver="midpoint", n_steps=12).shape
+        torch.Size([5, 2])
+
+        :param latents: z, where the flow starts, shape (..., dim).
+        :param features: s, of a leading shape that broadcasts, shape (..., features_dim).
+        :param solver: Name of the solver, see :func:`~.solvers.integrate`.
+        :param n_steps: Number of equal steps, at least 1.
+        :param end_time: T, where the flow ends.
+        :return: phi, the end points, of the shape of ``latents``.
+        :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
+        """
+        if is_foldable(self):
+            return integrate_folded(
+                self, latents, features, n_steps=n_steps, solver=solver, end_time=end_time
+            )
+        return integrate(
+            lambda points, time: self(points, time, features),
+            latents,
+            n_steps=n_steps,
+            solver=solver,
+            end_time=end_time,
+        )
 
 
 def _hidden_layers(

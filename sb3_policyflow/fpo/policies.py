@@ -1,34 +1,49 @@
-"""Policies of FPO: an action is the end of a flow."""
+"""Policies of FPO: an action is the end point of a flow."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import check_between
-from sb3_policyflow.common.ode_policy import OdeFlowPolicy
-from sb3_policyflow.flows import Rectified
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.options import FlowOptions
+from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.flows import SOLVERS, Flow, Rectified
+
+
+class FPOOptions(FlowOptions, total=False):
+    """The shared options, and those of the policy."""
+
+    n_flow_steps: int
+    solver: str
+    action_noise_std: float
 
 
 class NoRecord(NamedTuple):
-    """FPO asks nothing of how an action was made: it looks at the action alone."""
+    """FPO needs no record of how an action was made: its update looks at the action alone."""
 
 
-class FPOPolicy(OdeFlowPolicy):
-    """Actor-critic policy that carries Gaussian latents along a flow to the action.
+class FPOPolicy(FlowPolicy):
+    """Actor-critic policy that transports Gaussian latents along a flow to the action.
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to a = x_1
 
-    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
+    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
     :param n_flow_steps: Solver steps from z to the action.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
-    :param action_noise_std: Standard deviation of Gaussian noise on top of the flow's end.
+    :param action_noise_std: Standard deviation of Gaussian noise on top of the flow's end point.
+    :raises ValueError: If an option is not supported.
     """
 
-    own_parameters: ClassVar[tuple[str, ...]] = (*OdeFlowPolicy.own_parameters, "action_noise_std")
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "n_flow_steps": checks.at_least(1),
+        "solver": checks.one_of(SOLVERS),
+        "action_noise_std": checks.between(0.0),
+    }
 
     def __init__(
         self,
@@ -41,24 +56,32 @@ class FPOPolicy(OdeFlowPolicy):
         action_noise_std: float = 0.0,
         **kwargs: Any,
     ) -> None:
-        check_between("action_noise_std", action_noise_std, 0.0)
+        self.n_flow_steps = n_flow_steps
+        self.solver = solver
         self.action_noise_std = action_noise_std
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            *args,
-            flow_path=Rectified(),
-            n_flow_steps=n_flow_steps,
-            solver=solver,
-            **kwargs,
-        )
+        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
+
+    def _build_actor(self) -> None:
+        self.velocity = self._make_velocity_field()
+
+    @property
+    def flow(self) -> Flow:
+        """The flow from latents to actions."""
+        return Flow(self.velocity, Rectified(), self.solver, self.n_flow_steps)
+
+    @property
+    def n_evaluations_per_action(self) -> int:
+        return self.flow.n_evaluations
+
+    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """End points of the flow, see :meth:`FlowPolicy.transport`."""
+        return self.flow.solve(latents, features)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, NoRecord]:
         """Draw actions; the deterministic one has z = 0 and no noise (FPO++: zero-sampling)."""
-        actions = self.carry(self.draw_latents(features, deterministic), features)
+        actions = self.transport(self.draw_latents(features, deterministic), features)
         if self.action_noise_std > 0 and not deterministic:
             actions = actions + self.action_noise_std * th.randn_like(actions)
         return actions, NoRecord()
@@ -67,9 +90,13 @@ class FPOPolicy(OdeFlowPolicy):
 MlpFlowPolicy = FPOPolicy
 
 
-class CnnFlowPolicy(ImageFeatures, FPOPolicy):
-    """:class:`FPOPolicy` for images: its default features extractor is SB3's ``NatureCNN``."""
+class CnnFlowPolicy(FPOPolicy):
+    """:class:`FPOPolicy` for images: its default features extractor is ``NatureCNN``."""
+
+    default_features_extractor_class = NatureCNN
 
 
-class MultiInputFlowPolicy(DictFeatures, FPOPolicy):
-    """:class:`FPOPolicy` for Dict observations, by default with SB3's ``CombinedExtractor``."""
+class MultiInputFlowPolicy(FPOPolicy):
+    """:class:`FPOPolicy` for Dict observations, by default with ``CombinedExtractor``."""
+
+    default_features_extractor_class = CombinedExtractor

@@ -1,37 +1,37 @@
-"""Velocity fields evaluated and differentiated by kernels."""
+"""Velocity fields evaluated, differentiated and integrated by kernels."""
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from torch import nn
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
-from sb3_policyflow.kernels.compiler import kernels, note_fallback
-from sb3_policyflow.kernels.networks import (
+from sb3_policyflow.kernels.compiler import note_fallback
+from sb3_policyflow.kernels.flow import FlowPlans
+from sb3_policyflow.kernels.inspection import (
+    KernelView,
     Layer,
-    Perceptron,
-    Reader,
-    Reading,
-    addresses,
-    are_as_read,
-    in_memory,
-    is_eager,
+    ModuleInspector,
+    UnsupportedError,
+    are_usable,
 )
-from sb3_policyflow.kernels.perceptron import (
-    FirstLayer,
-    Pass,
+from sb3_policyflow.kernels.layouts import (
+    FieldGradients,
+    FieldLayout,
+    FirstLayerGradients,
+    Floats,
+    KernelInput,
+    Kernels,
+    TimeLayers,
+)
+from sb3_policyflow.kernels.mlp import (
+    MLP,
+    Evaluation,
     any_needs_grad,
     differentiable_gradients,
-    split_like,
+    read_mlp,
 )
-
-Array = NDArray[Any]
-N_EMBEDDING = 7
-"""Tensors of the embeddings: frequencies, and the parameters of three layers."""
 
 
 class FieldParts:
@@ -43,188 +43,162 @@ class FieldParts:
     :param network: The rest.
     """
 
-    def __init__(
-        self, frequencies: th.Tensor, time: Perceptron, observation: Layer, network: Perceptron
-    ) -> None:
+    def __init__(self, frequencies: th.Tensor, time: MLP, observation: Layer, network: MLP) -> None:
+        self.kernels = network.kernels
+        self.frequencies = frequencies
         self.time = time
         self.network = network
         self.dim = network.n_outputs
         self.features_dim = observation.weight.shape[1]
-        self.tensors = [frequencies, *time.parameters, *observation, *network.parameters]
+        # In the order of FieldLayout and of named_parameters.
+        self.embedding = [*time.tensors, *observation, *network.layers[0]]
+        self.parameters = [*self.embedding, *network.tensors[2:]]
+        self.tensors = [frequencies, *self.parameters]
         self.shapes = [tensor.shape for tensor in self.tensors]
 
-    def plain(
-        self,
-        times: th.Tensor,
-        leading: th.Size,
-        points: th.Tensor,
-        features: th.Tensor,
-        tensors: Sequence[th.Tensor],
-    ) -> th.Tensor:
-        """Velocities in plain torch, for derivatives of derivatives.
-
-        :param times: Of a shape that broadcasts with the leading shape.
-        :param leading: The shape that the n points have without their dimensions.
-        :param points: shape (n, dim).
-        :param features: shape (m, features_dim), where m divides n.
-        :param tensors: In place of the field's own.
-        """
-        phases = 2 * math.pi * times.unsqueeze(-1) * tensors[0]
-        time = self.time.plain(th.cat([phases.cos(), phases.sin()], dim=-1), tensors[1:5])
-        observation = nn.functional.linear(features, *tensors[5:N_EMBEDDING])
-        embedding = time.expand(*leading, -1).reshape(len(points), -1)
-        embedding = embedding + observation.repeat_interleave(len(points) // len(features), dim=0)
-        return self.network.plain(th.cat([points, embedding], dim=-1), tensors[N_EMBEDDING:])
-
-    def serve(self, points: th.Tensor, features: th.Tensor) -> bool:
+    def supports(self, points: th.Tensor, features: th.Tensor) -> bool:
         """Whether points and features are those of kernels, and of this field."""
         dims = points.shape[-1], features.shape[-1]
         is_known = dims == (self.dim, self.features_dim) and points.numel() > 0
-        return is_known and in_memory((points, features))
+        return is_known and are_usable((points, features))
+
+    def layout(self) -> FieldLayout:
+        """Where the embeddings and the first layer are in memory now."""
+        return FieldLayout(
+            self.dim,
+            self.time.activation.kind,
+            self.time.activation.alpha,
+            len(self.frequencies),
+            self.frequencies.data_ptr(),
+            *[tensor.data_ptr() for tensor in self.embedding],
+        )
 
 
-def read_field(reader: Reader, field: VelocityField) -> FieldParts | None:
-    """The parts of a field, or None if it is not of the kind that kernels know."""
-    embedding = reader.child(field, "time_embedding")
-    hidden = reader.child(field, "hidden")
-    if type(embedding) is FourierTimeEmbedding and isinstance(hidden, nn.Sequential):
-        mlp = reader.child(embedding, "mlp")
-        time = reader.perceptron(reader.children(mlp))
-        observation = reader.layer(reader.child(field, "observation_embedding"))
-        network = reader.perceptron((*reader.children(hidden), reader.child(field, "output")))
-        is_plain = reader.are_plain(field, hidden, embedding, mlp)
-        if time and observation and network and is_plain:
-            frequencies = reader.buffer(embedding, "frequencies")
-            return FieldParts(frequencies, time, observation, network)
-    note_fallback(f"{type(field).__name__} has layers, activations or hooks of another kind")
-    return None
+def _read_field(kernels: Kernels, inspector: ModuleInspector, field: VelocityField) -> FieldParts:
+    """Read the parts of a field, or raise :class:`UnsupportedError`."""
+    embedding = inspector.child(field, "time_embedding")
+    hidden = inspector.child(field, "hidden")
+    if type(embedding) is not FourierTimeEmbedding or not isinstance(hidden, nn.Sequential):
+        raise UnsupportedError("the velocity field has other parts than VelocityField's")
+    mlp = inspector.child(embedding, "mlp")
+    inspector.require_no_hooks(field, hidden, embedding, mlp)
+    return FieldParts(
+        inspector.buffer(embedding, "frequencies"),
+        read_mlp(kernels, inspector, inspector.children(mlp)),
+        inspector.layer(inspector.child(field, "observation_embedding")),
+        read_mlp(
+            kernels, inspector, [*inspector.children(hidden), inspector.child(field, "output")]
+        ),
+    )
 
 
-class FusedVelocityField(VelocityField):
-    """A :class:`VelocityField` that kernels evaluate where they can."""
+class KernelVelocityField(VelocityField, has_formula_of_paper=True):
+    """A :class:`VelocityField` that kernels evaluate and integrate where they can."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._reading = Reading(read_field)
+        self._view = KernelView(_read_field)
+        self._plans = FlowPlans()
 
-    def parts(self) -> FieldParts | None:
-        """What the field consists of, or None if kernels cannot work on it."""
-        if not is_eager() or kernels() is None:
-            return None
-        parts = self._reading.of(self)
-        if parts is None:
-            return None
-        if not are_as_read(parts.tensors, parts.shapes):
-            note_fallback("parameters are not contiguous float32 on the CPU")
-            return None
-        return parts
+    def parts(self) -> FieldParts | str:
+        """What the field consists of now, or the reason why kernels cannot work on it."""
+        return self._view.of(self)
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
-        if parts is None:
+        if isinstance(parts, str):
             return super().forward(points, times, features)
         # Parts of tensors, such as the starts of a chain's steps, are worth a copy.
         points, times, features = points.contiguous(), times.contiguous(), features.contiguous()
-        if not parts.serve(points, features) or not _is_data(times):
+        is_constant = are_usable((times,)) and not times.requires_grad
+        if not parts.supports(points, features) or not is_constant:
             note_fallback("a field is asked for what is not its own, or not float32 on the CPU")
             return super().forward(points, times, features)
         leading = points.shape[:-1]
         if features.shape[:-1] not in (leading, (*leading[:-1], 1)):
-            features = features.expand(*leading, -1)
-        flat = (points.reshape(-1, parts.dim), features.reshape(-1, parts.features_dim))
-        velocity: th.Tensor
-        if th.is_grad_enabled() and any_needs_grad((points, features, *parts.tensors)):
+            features = features.expand(*leading, -1).contiguous()
+        if th.is_grad_enabled() and any_needs_grad((points, features, *parts.parameters)):
             apply: Any = _FieldEvaluation.apply
-            velocity = apply(parts, times, leading, *flat, *parts.tensors)
-        else:
-            velocity, _ = _pass(parts, times, leading, *flat)[1].forth(keeps=False)
-        return velocity.view_as(points)
+            velocity: th.Tensor = apply(self, parts, times, points, features, *parts.parameters)
+            return velocity
+        _, evaluation = _evaluation(parts, times, points, features)
+        return evaluation.forward(saves=False)[0].view_as(points)
 
-
-def _is_data(times: th.Tensor) -> bool:
-    return in_memory((times,)) and not times.requires_grad
+    def integrate(
+        self,
+        latents: th.Tensor,
+        features: th.Tensor,
+        *,
+        solver: str,
+        n_steps: int,
+        end_time: float = 1.0,
+    ) -> th.Tensor:
+        is_matrix = latents.dim() == 2 and latents.shape[:-1] == features.shape[:-1]
+        if self.has_formula_of_paper and is_matrix and not th.is_grad_enabled():
+            parts = self.parts()
+            if not isinstance(parts, str) and parts.supports(latents, features):
+                plan = self._plans.get(self, parts, solver, n_steps, end_time)
+                return plan.transport(latents, features)
+        return super().integrate(
+            latents, features, solver=solver, n_steps=n_steps, end_time=end_time
+        )
 
 
 class _Embedding:
-    """What time and observation contribute to a field's first layer, and the way back.
+    """What time and observation contribute to a field's first layer, forward and backward.
 
     :param parts: The field.
-    :param times: shape (n_times,).
+    :param times: shape (...).
     :param features: shape (m, features_dim).
     """
 
-    def __init__(self, parts: FieldParts, times: Array, features: Array) -> None:
-        self._dim = parts.dim
-        self._times, self._features = times.reshape(-1).copy(), features
-        frequencies, width, size = parts.tensors[0], parts.network.widths[0], parts.time.n_outputs
-        self._n_frequencies = len(frequencies)
-        n_times = self._times.size
-        self._kept = np.empty((3, n_times, size), dtype=np.float32)
+    def __init__(self, parts: FieldParts, times: Floats, features: Floats) -> None:
+        self._parts, self._features = parts, features
+        self._times = times.reshape(-1).copy()
+        n_times, size, width = times.size, parts.time.n_outputs, parts.network.widths[0]
+        self._saved = TimeLayers(*np.empty((3, n_times, size), dtype=np.float32))
         table = np.empty((n_times, width), dtype=np.float32)
-        self.index = np.empty(n_times, dtype=np.int64)
+        self.entries = np.empty(n_times, dtype=np.int64)
         self.shifts = np.empty((len(features), width), dtype=np.float32)
-        module: Any = kernels()
-        n_distinct = module.embed(
+        n_distinct = parts.kernels.embed(
             self._times,
-            self.index,
-            self._n_frequencies,
+            self.entries,
             features,
-            addresses(parts.tensors[: N_EMBEDDING + 2]),
-            self._dim,
-            *parts.time.activation,
-            self._kept,
+            parts.layout(),
+            self._saved,
             table,
             self.shifts,
         )
         self._times, self.table = self._times[:n_distinct], table[:n_distinct]
 
-    def back(
-        self,
-        tensors: Sequence[th.Tensor],
-        grad_points: Array,
-        grad_table: Array,
-        grad_shifts: Array,
-        grad_features: Array,
-    ) -> th.Tensor:
-        """Gradients of the parameters up to the first layer, one behind the other.
+    def backward(self, first: FirstLayerGradients, grad_features: Floats) -> list[th.Tensor]:
+        """Gradients of the parameters up to the first layer.
 
-        :param tensors: Those of the field.
-        :param grad_points: Of W^T, shape (dim, width).
-        :param grad_table: Like the table.
-        :param grad_shifts: Like the shifts.
+        :param first: Those of the first layer's summands.
         :param grad_features: Filled; shape (m, features_dim), or empty if it is not wanted.
         """
-        tensors = tensors[: N_EMBEDDING + 2]
-        grads = th.empty(sum(tensor.numel() for tensor in tensors[1:]))
-        module: Any = kernels()
-        module.embed_backward(
-            self._times,
-            self._n_frequencies,
-            self._features,
-            addresses(tensors),
-            self._dim,
-            self._kept,
-            grad_points,
-            grad_table,
-            grad_shifts,
-            grads.numpy(),
-            grad_features,
+        grads = [th.empty(tensor.shape) for tensor in self._parts.embedding]
+        gradients = FieldGradients(grad_features, *[grad.numpy() for grad in grads])
+        self._parts.kernels.embed_backward(
+            self._times, self._features, self._parts.layout(), self._saved, first, gradients
         )
         return grads
 
 
-def _pass(
-    parts: FieldParts,
-    times: th.Tensor,
-    leading: th.Size,
-    points: th.Tensor,
-    features: th.Tensor,
-) -> tuple[_Embedding, Pass]:
-    embedding = _Embedding(parts, times.numpy(), features.detach().numpy())
-    index = np.broadcast_to(embedding.index.reshape(times.shape), leading).reshape(-1)
-    stride = parts.tensors[N_EMBEDDING].shape[1]
-    first = FirstLayer(points.detach().numpy(), stride, embedding.table, index, embedding.shifts)
-    return embedding, Pass(parts.network, first)
+def _evaluation(
+    parts: FieldParts, times: th.Tensor, points: th.Tensor, features: th.Tensor
+) -> tuple[_Embedding, Evaluation]:
+    flat_features = features.detach().reshape(-1, parts.features_dim)
+    embedding = _Embedding(parts, times.numpy(), flat_features.numpy())
+    entries = np.broadcast_to(embedding.entries.reshape(times.shape), points.shape[:-1])
+    first = KernelInput(
+        points.detach().reshape(-1, parts.dim).numpy(),
+        parts.network.n_inputs,
+        embedding.table,
+        entries.reshape(-1),
+        embedding.shifts,
+    )
+    return embedding, Evaluation(parts.network, first)
 
 
 class _FieldEvaluation(th.autograd.Function):
@@ -233,48 +207,68 @@ class _FieldEvaluation(th.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
+        field: VelocityField,
         parts: FieldParts,
         times: th.Tensor,
-        leading: th.Size,
         points: th.Tensor,
         features: th.Tensor,
-        *tensors: th.Tensor,
+        *parameters: th.Tensor,
     ) -> th.Tensor:
-        ctx.arguments = parts, times, leading
-        ctx.embedding, ctx.way = _pass(parts, times, leading, points, features)
+        ctx.field, ctx.parts, ctx.times = field, parts, times
+        ctx.embedding, ctx.evaluation = _evaluation(parts, times, points, features)
         outputs: th.Tensor
-        outputs, kept = ctx.way.forth(keeps=True)
-        ctx.save_for_backward(kept, points, features, *tensors)
-        return outputs
+        outputs, saved = ctx.evaluation.forward(saves=True)
+        # The frequencies, too, must not change before the backward pass.
+        ctx.save_for_backward(saved, points, features, parts.frequencies, *parameters)
+        return outputs.view_as(points)
 
     @staticmethod
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        kept, points, features, *tensors = ctx.saved_tensors
+        saved, points, features, _, *parameters = ctx.saved_tensors
         if th.is_grad_enabled():
-            parts, times, leading = ctx.arguments
-            outputs = parts.plain(times, leading, points, features, tensors)
-            grads = differentiable_gradients(outputs, ctx.saved_tensors[1:], grad_outputs)
+            reference = _Reference(ctx.field, ctx.times)
+            grads = differentiable_gradients(
+                reference, [points, features], parameters, grad_outputs
+            )
             return None, None, None, *grads
         needs_points, needs_features = ctx.needs_input_grad[3:5]
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])
-        embedding = ctx.embedding
-        flat, grad_shifts = ctx.way.back(
-            kept, tensors[N_EMBEDDING:], grad_outputs, grad_points.numpy()
+        n_embedding, parts = len(ctx.parts.embedding), ctx.parts
+        gradients = ctx.evaluation.backward(
+            saved,
+            parameters[n_embedding - 2 :],
+            grad_outputs.reshape(-1, parts.dim),
+            grad_points.view(-1, parts.dim).numpy(),
         )
-        dim, (n_times, width) = points.shape[1], embedding.table.shape
-        first = flat[: (dim + n_times) * width].view(-1, width).numpy()
-        up_to_first = embedding.back(
-            tensors, first[:dim], first[dim:], grad_shifts, grad_features.numpy()
+        first = FirstLayerGradients(
+            gradients.points.numpy(), gradients.table.numpy(), gradients.shifts
         )
-        others = flat[(dim + n_times) * width :]
+        of_embedding = ctx.embedding.backward(
+            first, grad_features.view(-1, parts.features_dim).numpy()
+        )
         return (
             None,
             None,
             None,
             grad_points if needs_points else None,
             grad_features if needs_features else None,
-            None,
-            *split_like(up_to_first, tensors[1 : N_EMBEDDING + 2]),
-            *split_like(others, tensors[N_EMBEDDING + 2 :]),
+            *of_embedding,
+            *gradients.others,
         )
+
+
+class _Reference(nn.Module):
+    """A field in plain torch, for derivatives of derivatives.
+
+    :param field: The field.
+    :param times: The times that it is evaluated at.
+    """
+
+    def __init__(self, field: VelocityField, times: th.Tensor) -> None:
+        super().__init__()
+        self.field = field
+        self._times = times
+
+    def forward(self, points: th.Tensor, features: th.Tensor) -> th.Tensor:
+        return VelocityField.forward(self.field, points, self._times, features)

@@ -7,17 +7,17 @@ from functools import cache
 
 import torch as th
 
-WORTHWHILE = 4_000_000
+MIN_FLOPS_PER_THREAD = 4_000_000
 """Multiplications for which it pays to wake another thread."""
 
 
-def n_parts(n_rows: int, work_per_row: int) -> int:
+def n_parts(n_rows: int, flops_per_row: int) -> int:
     """In how many parts to do some work.
 
     :param n_rows: How many rows there are.
-    :param work_per_row: Multiplications for each.
+    :param flops_per_row: Multiplications for each.
     """
-    return max(1, min(th.get_num_threads(), n_rows * work_per_row // WORTHWHILE, n_rows))
+    return max(1, min(th.get_num_threads(), n_rows * flops_per_row // MIN_FLOPS_PER_THREAD, n_rows))
 
 
 def in_parts(n_rows: int, parts: int, run: Callable[[int, int, int], None]) -> None:

@@ -3,7 +3,15 @@ from sb3_policyflow.policyflow.policies import (
     FlowPolicy,
     MlpFlowPolicy,
     MultiInputFlowPolicy,
+    PolicyFlowPolicy,
 )
 from sb3_policyflow.policyflow.policyflow import PolicyFlow
 
-__all__ = ["CnnFlowPolicy", "FlowPolicy", "MlpFlowPolicy", "MultiInputFlowPolicy", "PolicyFlow"]
+__all__ = [
+    "CnnFlowPolicy",
+    "FlowPolicy",
+    "MlpFlowPolicy",
+    "MultiInputFlowPolicy",
+    "PolicyFlow",
+    "PolicyFlowPolicy",
+]

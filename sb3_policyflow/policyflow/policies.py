@@ -1,17 +1,30 @@
-"""Policies of PolicyFlow: an action is the end of a flow plus Gaussian noise."""
+"""Policies of PolicyFlow: an action is the end point of a flow plus Gaussian noise."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_policyflow.common.aliases import DictFeatures, ImageFeatures
-from sb3_policyflow.common.checks import check_bounds, check_number, check_positive
-from sb3_policyflow.common.ode_policy import OdeFlowPolicy
-from sb3_policyflow.flows import PATHS
-from sb3_policyflow.flows.choices import choose
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.options import FlowOptions, accepts_former_names
+from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
+from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
+
+
+class PolicyFlowOptions(FlowOptions, total=False):
+    """The shared options, and those of the policy."""
+
+    interpolant: str
+    n_flow_steps: int
+    solver: str
+    latent_std: float
+    gaussian: bool
+    log_std_init: float
+    log_std_bounds: tuple[float, float] | None
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -21,93 +34,93 @@ class PolicyFlowRecord(NamedTuple):
     endpoints: th.Tensor
 
 
-class FlowPolicy(OdeFlowPolicy):
-    """Actor-critic policy that carries Gaussian latents along a flow (paper, policy of PolicyFlow).
+class PolicyFlowPolicy(BaseFlowPolicy):
+    """Actor-critic policy that transports Gaussian latents along a flow (paper, policy).
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
 
-    ``latent_std`` is not of the paper, whose latents are of standard deviation 1. What they add to
-    an action is noise that the importance ratio does not see, and where actions are bounded by 1 it
-    drowns sigma. With less of it locomotion is learned faster, HalfCheetah several times as fast;
-    tasks whose rewards have to be found first are learned less well (docs/results.md).
+    ``latent_std`` is not of the paper, whose latents have a standard deviation of 1. Latents add
+    noise to the actions that the importance ratio does not see; where actions are bounded by 1, it
+    is larger than sigma. Narrower latents learn locomotion faster (HalfCheetah several times as
+    fast), and learn tasks less well in which rewards have to be found first (docs/results.md).
 
-    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowActorCriticPolicy`, and:
+    Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
-    :param log_std_init: Initial log standard deviation of the Gaussian noise.
-    :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
-    :param latent_std: Standard deviation of the latents z, greater than 0. Other than 1 it needs a
-        path without noise of its own, "rectified" or "trigflow".
-    :param path: "rectified", "stochastic", "stochastic_exact" or "trigflow": the interpolation
-        path of the update, whose ``end_time`` T is where the flow ends.
+    :param interpolant: "rectified", "stochastic", "stochastic_exact" or "trigflow": the points at
+        which the update compares velocities. Its ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
+    :param latent_std: Standard deviation of the latents z, greater than 0. Other than 1 it needs an
+        interpolant without noise of its own, "rectified" or "trigflow".
     :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
+    :param log_std_init: Initial log standard deviation of the Gaussian noise.
+    :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
+    :raises ValueError: If an option is not supported.
     """
 
-    own_parameters: ClassVar[tuple[str, ...]] = (
-        *OdeFlowPolicy.own_parameters,
-        "log_std_init",
-        "log_std_bounds",
-        "latent_std",
-        "gaussian",
-    )
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "interpolant": checks.one_of(INTERPOLANTS),
+        "n_flow_steps": checks.at_least(1),
+        "solver": checks.one_of(SOLVERS),
+        "latent_std": checks.positive,
+        "log_std_init": checks.finite,
+        "log_std_bounds": checks.or_none(checks.bounds),
+    }
 
+    @accepts_former_names(path="interpolant")
     def __init__(
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
         lr_schedule: Schedule,
         *args: Any,
-        log_std_init: float = 0.0,
-        log_std_bounds: tuple[float, float] | None = None,
-        latent_std: float = 1.0,
-        path: str = "rectified",
+        interpolant: str = "rectified",
         n_flow_steps: int = 12,
         solver: str = "midpoint",
+        latent_std: float = 1.0,
         gaussian: bool = False,
+        log_std_init: float = 0.0,
+        log_std_bounds: tuple[float, float] | None = None,
         **kwargs: Any,
     ) -> None:
-        check_number("log_std_init", log_std_init)
-        if log_std_bounds is not None:
-            check_bounds("log_std_bounds", log_std_bounds)
-        self.log_std_bounds = log_std_bounds
+        self.interpolant = interpolant
+        self.n_flow_steps = n_flow_steps
+        self.solver = solver
         self.latent_std = latent_std
-        self.path_name = path
         self.gaussian = gaussian
-        self._check_latents()
-        super().__init__(
-            observation_space,
-            action_space,
-            lr_schedule,
-            *args,
-            flow_path=choose("path", path, PATHS)(),
-            n_flow_steps=n_flow_steps,
-            solver=solver,
-            **kwargs,
-        )
+        self.log_std_init = log_std_init
+        self.log_std_bounds = log_std_bounds
+        super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         # SB3 has set both to the defaults of its own actor.
         self.log_std_init = log_std_init
         nn.init.constant_(self.log_std, log_std_init)
         self.keep_within_bounds()
+        self._check_latents()
 
     def _check_latents(self) -> None:
-        check_positive("latent_std", self.latent_std)
         if self.latent_std == 1.0:
             return
         if self.gaussian:
             raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
-        if choose("path", self.path_name, PATHS).stochastic:
+        if self.flow.interpolant.stochastic:
             raise ValueError(
-                f"With path={self.path_name!r} the latents' standard deviation is 1: leave out "
-                "latent_std, or use path='rectified' or path='trigflow'."
+                f"With interpolant={self.interpolant!r} the latents' standard deviation is 1: "
+                "leave out latent_std, or use interpolant='rectified' or interpolant='trigflow'."
             )
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "path": self.path_name}
-
     def _build_actor(self) -> None:
-        super()._build_actor()
+        self.velocity = self._make_velocity_field()
         self.log_std = nn.Parameter(th.zeros(self.action_dim))
+
+    @property
+    def flow(self) -> Flow:
+        """The flow from latents to end points."""
+        interpolant = INTERPOLANTS[self.interpolant]()
+        return Flow(self.velocity, interpolant, self.solver, self.n_flow_steps)
+
+    @property
+    def n_evaluations_per_action(self) -> int:
+        return self.flow.n_evaluations
 
     @property
     def noise_log_std(self) -> th.Tensor:
@@ -118,34 +131,43 @@ class FlowPolicy(OdeFlowPolicy):
 
     def keep_within_bounds(self) -> None:
         if self.log_std_bounds is not None:
-            # Beyond its bounds it would have no gradient, and never come back.
+            # Beyond its bounds log_std would have no gradient, and never come back.
             with th.no_grad():
                 self.log_std.clamp_(*self.log_std_bounds)
 
-    def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
-        """Latents z, or 0 where nothing may be drawn, shape (n, action_dim)."""
-        if self.gaussian:
-            return features.new_zeros(len(features), self.action_dim)
-        return self.latent_std * super().draw_latents(features, deterministic)
+    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """End points phi, see :meth:`FlowPolicy.transport`."""
+        return self.flow.solve(latents, features)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
-        """Draw actions; the deterministic one has z = 0 and n = 0."""
-        latents = self.draw_latents(features, deterministic)
-        endpoints = self.carry(latents, features)
+        """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have z = 0, n = 0."""
+        if self.gaussian:
+            latents = features.new_zeros(len(features), self.action_dim)
+        else:
+            latents = self.latent_std * self.draw_latents(features, deterministic)
+        endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:
             return endpoints, record
         return endpoints + th.randn_like(endpoints) * self.noise_log_std.exp(), record
 
 
-MlpFlowPolicy = FlowPolicy
+MlpFlowPolicy = PolicyFlowPolicy
 
 
-class CnnFlowPolicy(ImageFeatures, FlowPolicy):
-    """:class:`FlowPolicy` for images: its default features extractor is SB3's ``NatureCNN``."""
+class CnnFlowPolicy(PolicyFlowPolicy):
+    """:class:`PolicyFlowPolicy` for images: its default features extractor is ``NatureCNN``."""
+
+    default_features_extractor_class = NatureCNN
 
 
-class MultiInputFlowPolicy(DictFeatures, FlowPolicy):
-    """:class:`FlowPolicy` for Dict observations, by default with SB3's ``CombinedExtractor``."""
+class MultiInputFlowPolicy(PolicyFlowPolicy):
+    """:class:`PolicyFlowPolicy` for Dict observations, by default with ``CombinedExtractor``."""
+
+    default_features_extractor_class = CombinedExtractor
+
+
+FlowPolicy = PolicyFlowPolicy
+"""Deprecated alias of :class:`PolicyFlowPolicy`, under which earlier versions saved it."""

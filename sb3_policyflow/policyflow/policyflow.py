@@ -1,47 +1,50 @@
 """PolicyFlow (paper, algorithm 1)."""
 
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv
+from typing_extensions import Unpack
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.aliases import flow_policy_aliases
-from sb3_policyflow.common.chunks import in_chunks
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import (
     gaussian_entropy,
     gaussian_kl,
     shifted_gaussian_log_ratio,
 )
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.options import FORMER_NAMES, shares_options
+from sb3_policyflow.common.policies import policy_aliases
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, PolicyTerms
+from sb3_policyflow.common.tree import in_chunks
+from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.flows import TIME_SAMPLERS
-from sb3_policyflow.policyflow.behavior import Behavior
 from sb3_policyflow.policyflow.policies import (
     CnnFlowPolicy,
-    FlowPolicy,
     MlpFlowPolicy,
     MultiInputFlowPolicy,
-    PolicyFlowRecord,
+    PolicyFlowOptions,
+    PolicyFlowPolicy,
 )
 from sb3_policyflow.policyflow.uniform import UniformTargets
 
-SelfPolicyFlow = TypeVar("SelfPolicyFlow", bound="PolicyFlow")
 
+def check_regularizers(model: "PolicyFlow") -> None:
+    """Refuse regularizers that the policy cannot have.
 
-class Probes(NamedTuple):
-    """Where an epoch compares new and old velocities, for n samples and k times each.
-
-    Times t (n, k), points x_t (n, k, action_dim), and the old velocity there (n, k, action_dim).
+    :raises ValueError: If there is no flow, or one that is stochastic, for them to act on.
     """
-
-    times: th.Tensor
-    points: th.Tensor
-    old_velocity: th.Tensor
+    if model.policy.gaussian and (model.brownian_coef, model.uniform_noise_coef) != (0.0, 0.0):
+        raise ValueError(
+            "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
+            "and uniform_noise_coef at 0, and use ent_coef."
+        )
+    if model.uniform_noise_coef != 0.0:
+        UniformTargets.of(model.policy)
 
 
 class PolicyFlow(FlowOnPolicyAlgorithm):
@@ -50,250 +53,168 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
     Paper: PolicyFlow: Policy Optimization with Continuous Normalizing Flow in Reinforcement
     Learning (ICLR 2026), https://arxiv.org/abs/2602.01156
 
-    PPO's update with the importance ratio of the Gaussian noise around a flow's end point, which
-    is taken to shift by the change of the velocity between latent and end point, and with an
-    entropy regularizer that lets the flow spread as Brownian motion would.
+    PPO's update, with an importance ratio of the Gaussian noise around a flow's end point. The
+    shift of the end point is estimated from the change of the velocity at points between latent and
+    end point. An entropy regularizer lets the flow spread as Brownian motion would.
 
     Takes the arguments of SB3's PPO with its names, order and defaults, those of
-    :class:`~sb3_policyflow.common.arguments.FlowAlgorithmArguments`, and:
+    :class:`~sb3_policyflow.common.algorithm.FlowOnPolicyAlgorithm`, the options of
+    :class:`~sb3_policyflow.policyflow.PolicyFlowPolicy`, and:
 
     :param brownian_coef: w_b, weight of the Brownian regularizer: a constant, "lin_START",
         "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
         entropy of the Gaussian noise and takes the same forms.
-    :param path: Interpolation path: "rectified", "stochastic", "stochastic_exact" or "trigflow". In
-        ``load``, whose file is a ``path`` too, change it by ``custom_objects={"path": ...}``.
-    :param time_sampler: Times of the update: "grid" (the solver's own), "starts" (the same without
-        the end) or "uniform".
+    :param time_sampler: Times of the update: "grid" (the solver's own), "grid_without_end" or
+        "uniform".
     :param n_times: Times for each sample.
     :param time_average: With several times, whether each has its own surrogate ("objective") or
         their mean shift makes one ("shift").
-    :param n_flow_steps: Solver steps from latent to action.
-    :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
     :param brownian_reduction: "sum" over action dimensions, or their "mean".
-    :param gaussian: Whether the latents are always 0, which leaves a Gaussian policy. With
-        ``solver="euler"``, ``n_flow_steps=1`` and ``time_sampler="starts"`` it is PPO's, exactly.
     :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
         regularizer (Ding et al., 2024). Takes the forms of ``brownian_coef``.
-    :param log_ratio_clamp: Greatest absolute log ratio that learns; beyond it there is no gradient
-        and no overflow. None for none. ``train/log_ratio_max`` tells what it was before.
+    :param log_ratio_clamp: Log ratios beyond it have no gradient and do not overflow; None for no
+        bound. ``train/log_ratio_max`` is the greatest one before the clamp.
     :raises ValueError: If an argument cannot be used.
     """
 
-    policy_base = FlowPolicy
-    policy: FlowPolicy
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = flow_policy_aliases(
+    policy_base = PolicyFlowPolicy
+    policy: PolicyFlowPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = policy_aliases(
         MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
     )
-    policy_arguments = ("path", "n_flow_steps", "solver", "gaussian")
+    former_names: ClassVar[Mapping[str, str]] = {**FORMER_NAMES, "path": "interpolant"}
     divergence_advice = ", or keep log_std_bounds of the noise away from zero"
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "brownian_coef": parse_schedule,
+        "time_sampler": checks.one_of(TIME_SAMPLERS),
+        "n_times": checks.at_least(1),
+        "time_average": checks.one_of(("objective", "shift")),
+        "brownian_reduction": checks.one_of(("sum", "mean")),
+        "uniform_noise_coef": parse_schedule,
+        "log_ratio_clamp": checks.positive_or_none,
+    }
+    model_checks = (check_regularizers,)
 
+    @shares_options(FlowOnPolicyAlgorithm, PolicyFlowPolicy, former_names)
     def __init__(
         self,
-        policy: str | type[FlowPolicy],
+        policy: str | type[PolicyFlowPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        n_steps: int = 2048,
-        batch_size: int = 64,
-        n_epochs: int = 10,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
-        normalize_advantage: bool = True,
-        ent_coef: Coefficient = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float | None = 0.5,
-        use_sde: bool = False,
-        sde_sample_freq: int = -1,
-        rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
-        target_kl: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
-        *,
+        *args: Any,
         brownian_coef: Coefficient = 0.0,
-        path: str = "rectified",
         time_sampler: str = "grid",
         n_times: int = 1,
         time_average: str = "objective",
-        n_flow_steps: int = 12,
-        solver: str = "midpoint",
         brownian_reduction: str = "sum",
-        gaussian: bool = False,
         uniform_noise_coef: Coefficient = 0.0,
         log_ratio_clamp: float | None = None,
-        desired_kl: Coefficient | None = None,
-        lr_adaptation: str = "epoch",
-        lr_factor: float = 1.5,
-        lr_bounds: tuple[float, float] = (1e-6, 1e-2),
-        kl_margin: float = 2.0,
-        kl_window: str = "epoch",
-        advantage_scope: str = "minibatch",
-        timeout_bootstrap: str = "terminal",
+        **options: Unpack[PolicyFlowOptions],
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            batch_size=batch_size,
-            n_epochs=n_epochs,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip_range=clip_range,
-            clip_range_vf=clip_range_vf,
-            normalize_advantage=normalize_advantage,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
-            target_kl=target_kl,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
-            desired_kl=desired_kl,
-            lr_adaptation=lr_adaptation,
-            lr_factor=lr_factor,
-            lr_bounds=lr_bounds,
-            kl_margin=kl_margin,
-            kl_window=kl_window,
-            advantage_scope=advantage_scope,
-            timeout_bootstrap=timeout_bootstrap,
-        )
         self.brownian_coef = brownian_coef
-        self.path = path
         self.time_sampler = time_sampler
         self.n_times = n_times
         self.time_average = time_average
-        self.n_flow_steps = n_flow_steps
-        self.solver = solver
         self.brownian_reduction = brownian_reduction
-        self.gaussian = gaussian
         self.uniform_noise_coef = uniform_noise_coef
         self.log_ratio_clamp = log_ratio_clamp
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, *args, **options)
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        checks.check_choice("time_sampler", self.time_sampler, TIME_SAMPLERS)
-        checks.check_count("n_times", self.n_times, 1)
-        checks.check_choice("time_average", self.time_average, ("objective", "shift"))
-        checks.check_choice("brownian_reduction", self.brownian_reduction, ("sum", "mean"))
-        checks.check_positive_or_none("log_ratio_clamp", self.log_ratio_clamp)
-        if self.gaussian and (self.brownian_coef, self.uniform_noise_coef) != (0.0, 0.0):
-            raise ValueError(
-                "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
-                "and uniform_noise_coef at 0, and use ent_coef."
-            )
+    @property
+    def n_evaluations_per_sample(self) -> int:
+        """Evaluations of the velocity for one sample in one gradient step, with the reference's."""
+        return 2 * self.n_times
 
-    def _setup_schedules(self) -> None:
-        super()._setup_schedules()
-        self._brownian_schedule = parse_schedule("brownian_coef", self.brownian_coef)
-        self._times = TIME_SAMPLERS[self.time_sampler](self.policy.solver_times())
-        self._uniform_schedule = parse_schedule("uniform_noise_coef", self.uniform_noise_coef)
-        self._uniform: UniformTargets | None = None
-        if self.uniform_noise_coef != 0.0:
-            assert isinstance(self.action_space, spaces.Box)
-            self._uniform = UniformTargets(
-                self.action_space, self.policy.path, self.policy.latent_std
-            )
+    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> "PolicyFlowUpdate":
+        return PolicyFlowUpdate(self, rollout)
 
-    def _excluded_save_params(self) -> list[str]:
-        derived = ["_brownian_schedule", "_uniform_schedule", "_uniform", "_times"]
-        return [*super()._excluded_save_params(), *derived]
 
-    def _behavior(self, rollout: FlowRolloutBufferSamples) -> Behavior:
-        """The policy before the update, theta-hat and sigma-hat."""
-        features = in_chunks(self.policy.actor_features, rollout.observations)
-        return Behavior(self.policy, features)
+class PathSamples(NamedTuple):
+    """Where velocities are compared, for n samples and k times each.
 
-    def _draw_probes(self, rollout: FlowRolloutBufferSamples, behavior: Behavior) -> Probes:
-        """Draw t for each sample and look up the old velocity at x_t."""
-        record: PolicyFlowRecord = rollout.record
-        times = self._times.sample(len(rollout.actions), self.n_times)
-        latents, endpoints = record.latents.unsqueeze(1), record.endpoints.unsqueeze(1)
-        points = self.policy.path.interpolate(latents, endpoints, times)
-        return Probes(times, points, behavior.velocity(points, times))
+    Times t (n, k), points x_t (n, k, action_dim), and the velocity v-hat of the reference policy
+    there (n, k, action_dim).
+    """
 
-    def _policy_terms(
-        self, batch: FlowRolloutBufferSamples, features: th.Tensor, behavior: Behavior
-    ) -> PolicyTerms:
-        """Ratio and regularizers from the change of the velocity (paper, ratio and J^Reg)."""
-        probes: Probes = batch.probes
-        velocity = self.policy.velocity(probes.points, probes.times, features.unsqueeze(1))
-        change = velocity - probes.old_velocity
-        # On a path of length T, the end point shifts by T times the mean change.
-        shift = self.policy.path.end_time * change
+    times: th.Tensor
+    points: th.Tensor
+    reference_velocity: th.Tensor
+
+
+class PolicyFlowUpdate(FlowUpdate):
+    """Algorithm 1 for one rollout: line 3, and in each epoch lines 15 to 18, 20 and 21.
+
+    :param algorithm: The algorithm, whose policy has not been updated yet.
+    :param rollout: The whole rollout of n samples.
+    """
+
+    def __init__(self, algorithm: PolicyFlow, rollout: FlowRolloutBufferSamples) -> None:
+        self.policy = policy = algorithm.policy
+        self.flow = policy.flow
+        # Line 3: the reference policy, theta-hat and sigma-hat. Its features are extracted once.
+        self.reference_field = deepcopy(policy.velocity)
+        self.reference_log_std = policy.noise_log_std.detach().clone()
+        self.reference_features = in_chunks(policy.actor_features, rollout.observations)
+        self.time_sampler = TIME_SAMPLERS[algorithm.time_sampler](self.flow.times())
+        self.n_times = algorithm.n_times
+        self.time_average = algorithm.time_average
+        self.clip_range = algorithm.value_of("clip_range")
+        self.log_ratio_clamp = algorithm.log_ratio_clamp
+        self.brownian_coef = algorithm.value_of("brownian_coef")  # w_b
+        self.brownian_reduction = algorithm.brownian_reduction
+        self.ent_coef = algorithm.value_of("ent_coef")  # w_g
+        self.uniform_coef = algorithm.value_of("uniform_noise_coef")
+        has_targets = algorithm.uniform_noise_coef != 0.0
+        self.uniform_targets = UniformTargets.of(policy) if has_targets else None
+
+    def draw(self, rollout: FlowRolloutBufferSamples) -> PathSamples:
+        """Times and points for each sample, with the reference velocity there."""
+        latents = rollout.record.latents.unsqueeze(1)
+        endpoints = rollout.record.endpoints.unsqueeze(1)
+        # Lines 15 and 16: t from the solver's time grid, or uniform.
+        times = self.time_sampler.sample(len(latents), self.n_times)
+        # Line 17: the interpolation points x_t.
+        points = self.flow.interpolant.interpolate(latents, endpoints, times)
+        inputs = points, times, self.reference_features.unsqueeze(1)
+        return PathSamples(times, points, in_chunks(lambda x: self.reference_field(*x), inputs))
+
+    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
+        """Importance ratio and regularizers from the change of the velocity."""
+        drawn: PathSamples = batch.drawn
+        velocity = self.policy.velocity(drawn.points, drawn.times, features.unsqueeze(1))
+        # Line 18: the log ratio of n = a - phi under noise that is shifted with the end point. On
+        # an interpolant of length T, that is T times the mean change of the velocity.
+        change = velocity - drawn.reference_velocity
+        shift = self.flow.interpolant.end_time * change
         if self.time_average == "shift":
             shift = shift.mean(dim=1, keepdim=True)
         noise = (batch.actions - batch.record.endpoints).unsqueeze(1)
-        log_std, old_log_std = self.policy.noise_log_std, behavior.log_std
-        log_ratio = shifted_gaussian_log_ratio(noise, shift, log_std, old_log_std)
-        regularizer, figures = self._regularizer(probes, velocity, features)
-        if self.log_ratio_clamp is not None:
-            figures["log_ratio_max"] = log_ratio.detach().abs().max()
-            log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
-        return PolicyTerms(
-            log_ratio=log_ratio,
-            kl=gaussian_kl(shift.detach(), log_std.detach(), old_log_std).mean(),
-            regularizer=regularizer,
-            metrics={**figures, "velocity_change": change.detach().norm(dim=-1).mean()},
+        log_std = self.policy.noise_log_std
+        log_ratio = shifted_gaussian_log_ratio(noise, shift, log_std, self.reference_log_std)
+        # Lines 20 and 21: the Brownian regularizer and the entropy of the noise. A term without
+        # weight is logged, but needs no gradient.
+        brownian_loss = self.brownian_loss(
+            drawn, velocity if self.brownian_coef != 0 else velocity.detach()
         )
+        entropy = gaussian_entropy(log_std)
+        regularizer = self.brownian_coef * brownian_loss - self.ent_coef * entropy
+        metrics = {"brownian_loss": brownian_loss, "entropy_loss": -entropy}
+        if self.uniform_targets is not None:
+            uniform_loss = self.uniform_targets.loss(self.policy.velocity, features)
+            regularizer = regularizer + self.uniform_coef * uniform_loss
+            metrics["uniform_noise_loss"] = uniform_loss
+        metrics["velocity_change"] = change.detach().norm(dim=-1).mean()
+        kl = gaussian_kl(shift.detach(), log_std.detach(), self.reference_log_std).mean()
+        return PolicyTerms(log_ratio, kl, regularizer, metrics)
 
-    def _regularizer(
-        self, probes: Probes, velocity: th.Tensor, features: th.Tensor
-    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """What keeps the policy from becoming narrow, and its parts to log."""
-        brownian_coef = self._now(self._brownian_schedule)
-        ent_coef = self._now(self._entropy_schedule)
-        # What has no weight is looked at, but needs no gradient.
-        brownian_loss = self._brownian_loss(
-            probes, velocity if brownian_coef != 0 else velocity.detach()
-        )
-        entropy = gaussian_entropy(self.policy.noise_log_std)
-        regularizer = brownian_coef * brownian_loss - ent_coef * entropy
-        figures = {"brownian_loss": brownian_loss, "entropy_loss": -entropy}
-        if self._uniform is not None:
-            uniform_loss = self._uniform.loss(self.policy.velocity, features)
-            regularizer = regularizer + self._now(self._uniform_schedule) * uniform_loss
-            figures["uniform_noise_loss"] = uniform_loss
-        return regularizer, figures
+    def brownian_loss(self, drawn: PathSamples, velocity: th.Tensor) -> th.Tensor:
+        """Mean over samples of ||eta||^2 (paper, J^Reg).
 
-    def _brownian_loss(self, probes: Probes, velocity: th.Tensor) -> th.Tensor:
-        """Mean over samples of ||eta||^2 (paper, J^Reg)."""
-        eta = self.policy.path.brownian_residual(
-            velocity, probes.old_velocity, probes.points, probes.times, self.policy.latent_std
+        :param drawn: Where velocities are compared.
+        :param velocity: v there, shape (n, k, action_dim).
+        """
+        eta = self.flow.interpolant.brownian_residual(
+            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.policy.latent_std
         )
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)
         return over_actions.mean()
-
-    def _log_policy(self) -> None:
-        self.logger.record("train/std", self.policy.noise_log_std.exp().mean().item())
-
-    def learn(
-        self: SelfPolicyFlow,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "PolicyFlow",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfPolicyFlow:
-        """Train for ``total_timesteps``; see SB3."""
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )

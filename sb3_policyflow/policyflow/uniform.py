@@ -3,11 +3,12 @@
 import torch as th
 from gymnasium import spaces
 
-from sb3_policyflow.flows import Path, VelocityField
+from sb3_policyflow.flows import Interpolant, VelocityField
+from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
 
 
 class UniformTargets:
-    """Pulls a flow towards the uniform distribution over the actions.
+    """Trains a flow towards the uniform distribution over the actions.
 
     E ||v(x_t, t, s) - dx_t/dt||^2,    x_t between a latent z and u ~ U(actions),  t ~ U(0, T)
 
@@ -16,21 +17,29 @@ class UniformTargets:
     with flow matching in place of its noise prediction; summed over action dimensions.
 
     :param action_space: The actions; SB3 takes bounded ones only.
-    :param path: The interpolation path.
+    :param interpolant: The interpolant of the update.
     :param latent_std: Standard deviation of the latents.
-    :raises ValueError: If the path draws noise of its own.
+    :raises ValueError: If the interpolant draws noise of its own.
     """
 
-    def __init__(self, action_space: spaces.Box, path: Path, latent_std: float = 1.0) -> None:
-        if path.stochastic:
+    def __init__(
+        self, action_space: spaces.Box, interpolant: Interpolant, latent_std: float = 1.0
+    ) -> None:
+        if interpolant.stochastic:
             raise ValueError(
-                "uniform_noise_coef needs a path without noise of its own: use path='rectified' "
-                "or path='trigflow'."
+                "uniform_noise_coef needs an interpolant without noise of its own: use "
+                "interpolant='rectified' or interpolant='trigflow'."
             )
-        self._path = path
+        self._interpolant = interpolant
         self._latent_std = latent_std
         self._low = th.as_tensor(action_space.low).flatten()
         self._high = th.as_tensor(action_space.high).flatten()
+
+    @classmethod
+    def of(cls, policy: PolicyFlowPolicy) -> "UniformTargets":
+        """The targets of a policy's flow."""
+        assert isinstance(policy.action_space, spaces.Box)
+        return cls(policy.action_space, policy.flow.interpolant, policy.latent_std)
 
     def loss(self, velocity: VelocityField, features: th.Tensor) -> th.Tensor:
         """The mean squared error of the velocity.
@@ -42,8 +51,8 @@ class UniformTargets:
         low, high = self._low.to(features), self._high.to(features)
         uniform = low + (high - low) * features.new_empty(len(features), len(low)).uniform_()
         latents = self._latent_std * th.randn_like(uniform)
-        times = self._path.end_time * features.new_empty(len(features)).uniform_()
-        points = self._path.interpolate(latents, uniform, times)
-        target = self._path.derivative(latents, uniform, times)
+        times = self._interpolant.end_time * features.new_empty(len(features)).uniform_()
+        points = self._interpolant.interpolate(latents, uniform, times)
+        target = self._interpolant.derivative(latents, uniform, times)
         error: th.Tensor = velocity(points, times, features) - target
         return error.square().sum(-1).mean()

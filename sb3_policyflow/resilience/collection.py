@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
@@ -19,11 +16,11 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_policyflow.resilience.finite import check_finite, check_rollout
-from sb3_policyflow.resilience.workers import wait_for_workers, workers_watched
+from sb3_policyflow.resilience.finite import check_finite
+from sb3_policyflow.resilience.workers import wait_for_workers
 
 Infos = list[dict[str, Any]]
-MEND = "mend the environment, or find the cause with stable_baselines3.common.vec_env.VecCheckNan"
+ADVICE = "fix the environment, or find the cause with stable_baselines3.common.vec_env.VecCheckNan"
 
 
 class RolloutVecEnv(VecEnvWrapper):
@@ -128,7 +125,7 @@ class RolloutVecEnv(VecEnvWrapper):
     def _check_finite(
         self, name: str, values: np.ndarray, indices: list[int] | None = None
     ) -> None:
-        check_finite(values, f"The environment's {name}", self._timestep, MEND, indices)
+        check_finite(values, f"The environment's {name}", self._timestep, ADVICE, indices)
 
     def _check_shape(self, name: str, values: np.ndarray, space: spaces.Space[Any]) -> None:
         if values.shape[1:] != space.shape:
@@ -169,7 +166,7 @@ def terminal_observations(infos: Infos, indices: list[int]) -> Any:
 
 
 @contextmanager
-def statistics_kept(normalize: VecNormalize | None) -> Iterator[None]:
+def rollback_statistics(normalize: VecNormalize | None) -> Iterator[None]:
     """Undo what a number that is not finite has done to running statistics.
 
     ``VecNormalize`` takes it in before anyone sees it, and would never be rid of it.
@@ -184,83 +181,3 @@ def statistics_kept(normalize: VecNormalize | None) -> Iterator[None]:
         if normalize is not None:
             vars(normalize).update(kept)
         raise
-
-
-class CollectionMixin(OnPolicyAlgorithm):
-    """SB3's collection of rollouts, through a :class:`RolloutVecEnv`."""
-
-    timeout_bootstrap: str
-    _collector: RolloutVecEnv | None = None
-
-    @contextmanager
-    def _guarded(self) -> Iterator[VecEnv]:
-        """A block that uses the environment, whose faults are named and undone where they can."""
-        assert self.env is not None
-        watched = workers_watched(self.env, lambda: self.num_timesteps)
-        with watched, statistics_kept(self.get_vec_normalize_env()):
-            yield self.env
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.env is None:
-            raise ValueError(
-                "The model has no environment to learn in: give one to load, as env, or to set_env."
-            )
-        with self._guarded() as env:
-            prepared = super()._setup_learn(*args, **kwargs)
-            RolloutVecEnv(env, self.num_timesteps).check_observations(self._last_obs)
-        return prepared
-
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: RolloutBuffer,
-        n_rollout_steps: int,
-    ) -> bool:
-        """Collect one rollout; see SB3.
-
-        :raises FloatingPointError: If environment or policy return a number that is not finite.
-        :raises RuntimeError: If a worker process of the environment has died.
-        """
-        first_timestep = self.num_timesteps
-        try:
-            with self._guarded():
-                self._collector = RolloutVecEnv(env, first_timestep)
-                complete = super().collect_rollouts(
-                    self._collector, callback, rollout_buffer, n_rollout_steps
-                )
-        finally:
-            self._collector = None
-        if complete:
-            check_rollout(rollout_buffer, first_timestep)
-        return complete
-
-    def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
-        # SB3's loop calls this after the callbacks and before it bootstraps.
-        super()._update_info_buffer(infos, dones)
-        if self._collector is not None and dones is not None:
-            self._collector.bootstrap_timeouts(
-                infos, dones, lambda indices: self._timeout_values(infos, indices), self.gamma
-            )
-
-    def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
-        """Values of the states with which episodes go on behind their time limits."""
-        if self.timeout_bootstrap == "none":
-            return th.zeros(len(indices))
-        if self.timeout_bootstrap == "current":
-            observations = _rows(self._last_obs, indices)
-        else:
-            observations = terminal_observations(infos, indices)
-            assert self._collector is not None
-            self._collector.check_observations(observations, "terminal observation", indices)
-        with th.no_grad():
-            return self.policy.predict_values(self.policy.obs_to_tensor(observations)[0])
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_collector"]
-
-
-def _rows(observations: Any, indices: list[int]) -> Any:
-    if isinstance(observations, dict):
-        return {key: values[indices] for key, values in observations.items()}
-    return observations[indices]

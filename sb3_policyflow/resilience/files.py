@@ -1,5 +1,6 @@
-"""Files that are whole: written completely or not at all, and checked before they are used."""
+"""Files that are written completely or not at all, and checked before they are used."""
 
+import io
 import os
 import uuid
 import warnings
@@ -13,7 +14,7 @@ from stable_baselines3.common.save_util import open_path
 
 
 @contextmanager
-def written_whole(path: str | Path, suffix: str = "") -> Iterator[IO[bytes]]:
+def atomic_write(path: str | Path, suffix: str = "") -> Iterator[IO[bytes]]:
     """A file to write, which takes the place of ``path`` at the end of the block, or never.
 
     What is written goes to a temporary file in the same folder, reaches the disk, and is renamed:
@@ -22,7 +23,7 @@ def written_whole(path: str | Path, suffix: str = "") -> Iterator[IO[bytes]]:
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with written_whole(Path(folder) / "a") as file:
+    ...     with atomic_write(Path(folder) / "a") as file:
     ...         _ = file.write(b"new")
     ...     (Path(folder) / "a").read_bytes()
     b'new'
@@ -64,6 +65,17 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def opened(path: str | Path | io.BufferedIOBase, suffix: str) -> Iterator[Any]:
+    """A file to read; one that the user has opened stays open."""
+    file = open_path(path, "r", suffix=suffix)
+    try:
+        yield file
+    finally:
+        if isinstance(path, (str, Path)):
+            file.close()
 
 
 def check_archive(file: IO[bytes], path: Any, members: tuple[str, ...]) -> None:

@@ -26,7 +26,7 @@ def wait_for_workers(venv: VecEnv) -> None:
 
 
 @contextmanager
-def workers_watched(venv: VecEnv, timestep: Callable[[], int]) -> Iterator[None]:
+def watch_workers(venv: VecEnv, timestep: Callable[[], int]) -> Iterator[None]:
     """A block that uses an environment, and says which of its worker processes has died.
 
     :param venv: The environment, with its wrappers.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -286,13 +286,15 @@ def test_evaluation_leaves_the_training_alone() -> None:
 
 def test_costs() -> None:
     small: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
-    flow = PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small)
-    assert costs.evaluations_per_action(flow) == 24
-    assert costs.evaluations_per_sample(flow) == 6
-    chain = DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small)
-    assert costs.evaluations_per_action(chain) == 10
-    assert costs.evaluations_per_sample(chain) == 4
-    steps = costs.GradientSteps(chain)
-    chain.learn(32)
-    assert steps.count == 4
-    assert costs.network_evaluations(chain, steps.count) == {"acting": 320, "updating": 4 * 8 * 4}
+    for algorithm, per_action, per_sample in [
+        (PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small), 24, 6),
+        (DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small), 10, 4),
+        (PPO("MlpPolicy", "Pendulum-v1", **small), 1, 1),
+    ]:
+        steps = costs.GradientSteps(algorithm)
+        algorithm.learn(32)
+        assert steps.count == 4
+        found = costs.network_evaluations(algorithm, steps.count)
+        assert found == {"acting": 32 * per_action, "updating": 4 * 8 * per_sample}
+    whole = A2C("MlpPolicy", "Pendulum-v1", n_steps=16)
+    assert costs.network_evaluations(whole, 2)["updating"] == 2 * 16

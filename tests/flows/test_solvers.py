@@ -66,7 +66,7 @@ def test_velocity_is_looked_up_on_the_grid_and_as_often_as_said(solver: str) -> 
 
     integrate(recording, LATENTS, n_steps=5, solver=solver)
     grid = solver_times(solver, 5).tolist()
-    assert len(seen) == 5 * SOLVERS[solver].evaluations
+    assert len(seen) == 5 * SOLVERS[solver].n_stages
     assert set(seen) <= set(grid)
     assert grid[0] == 0.0
     assert grid[-1] == 1.0

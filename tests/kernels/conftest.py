@@ -4,16 +4,16 @@ from collections.abc import Iterator
 
 import pytest
 
-from sb3_policyflow.kernels.compiler import SWITCH, kernels, note_fallback
+from sb3_policyflow.kernels.compiler import SWITCH, load_kernels, note_fallback
 
 
 @pytest.fixture
 def no_kernels(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Turn the kernels off."""
     monkeypatch.setenv(SWITCH, "0")
-    kernels.cache_clear()
+    load_kernels.cache_clear()
     note_fallback.cache_clear()
     yield
     monkeypatch.undo()
-    kernels.cache_clear()
+    load_kernels.cache_clear()
     note_fallback.cache_clear()

@@ -1,12 +1,13 @@
-"""What kernels are compared with: the same weights in plain torch."""
+"""What kernels work on, and what they are compared with: the same weights in plain torch."""
 
 from typing import Any
 
 import torch as th
+from stable_baselines3.common.torch_layers import MlpExtractor
 from torch import nn
 
 from sb3_policyflow.flows import VelocityField, integrate
-from sb3_policyflow.kernels.fields import FusedVelocityField
+from sb3_policyflow.kernels import KernelCritic, make_velocity_field
 
 ACTIVATIONS: list[Any] = [
     nn.Mish,
@@ -41,14 +42,36 @@ def plain_copy(field: VelocityField) -> VelocityField:
 
 def make_field(
     dim: int, features_dim: int, widths: list[int], activation: Any = nn.Tanh, **options: Any
-) -> FusedVelocityField:
+) -> VelocityField:
     """A field whose velocity is not zero."""
-    return FusedVelocityField(
+    return make_velocity_field(
         dim, features_dim, widths, activation, initialization="glorot", **options
     )
 
 
-def carry_plainly(field: VelocityField, z: th.Tensor, s: th.Tensor, **options: Any) -> th.Tensor:
+def integrate_plainly(
+    field: VelocityField, z: th.Tensor, s: th.Tensor, **options: Any
+) -> th.Tensor:
     """End points as the definition has them."""
     plain = plain_copy(field)
     return integrate(lambda x, t: plain(x, t, s), z, **options)
+
+
+class Critic(nn.Module):
+    """A critic where SB3's policies have theirs, evaluated by kernels.
+
+    :param layers: Linear layers and the activations between them.
+    """
+
+    def __init__(self, *layers: nn.Module) -> None:
+        super().__init__()
+        self.plain = nn.Sequential(*layers)
+        self.mlp_extractor = MlpExtractor(1, {"pi": [], "vf": []}, nn.Tanh)
+        self.mlp_extractor.value_net = self.plain[:-1]
+        self.value_net = layers[-1]
+        self._kernel_critic = KernelCritic()
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        values = self._kernel_critic(self, inputs)
+        assert values is not None
+        return values

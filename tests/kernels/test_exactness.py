@@ -10,10 +10,15 @@ from torch import nn
 
 from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.kernels.activations import Activation
-from sb3_policyflow.kernels.networks import Perceptron, Reader
-from sb3_policyflow.kernels.perceptron import evaluate_perceptron
-from sb3_policyflow.kernels.sampler import FlowSampler
-from tests.kernels.plain import ACTIVATIONS, SHAPES, carry_plainly, make_field, plain_copy
+from sb3_policyflow.kernels.inspection import ModuleInspector
+from tests.kernels.plain import (
+    ACTIVATIONS,
+    SHAPES,
+    Critic,
+    integrate_plainly,
+    make_field,
+    plain_copy,
+)
 
 
 def close(ours: th.Tensor, theirs: th.Tensor, ulps: float = 60) -> None:
@@ -27,10 +32,8 @@ def test_activations_and_derivatives(activation: Any) -> None:
     """Against torch in float64; a network of one unit is its activation."""
     module = activation()
     x = th.cat([th.linspace(-100, 100, 2001), th.linspace(-1, 1, 2001)]).view(-1, 1)
-    network = read_identity(module)
     inputs = x.clone().requires_grad_()
-    ours = evaluate_perceptron(network, inputs)
-    assert ours is not None
+    ours = identity(module)(inputs)
     ours.sum().backward()
     exact = x.double().requires_grad_()
     theirs = module(exact)
@@ -41,22 +44,19 @@ def test_activations_and_derivatives(activation: Any) -> None:
     th.testing.assert_close(inputs.grad.double(), exact.grad, rtol=2e-6, atol=5e-7)
 
 
-def read_identity(module: nn.Module) -> Perceptron:
+def identity(module: nn.Module) -> Critic:
     """A network of one unit that is its activation."""
     layers = nn.Linear(1, 1), module, nn.Linear(1, 1)
     for layer in (layers[0], layers[2]):
         nn.init.ones_(layer.weight)
         nn.init.zeros_(layer.bias)
-    network = Reader().perceptron(layers)
-    assert network is not None
-    return network
+    return Critic(*layers)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_not_a_number_stays_one(activation: Any) -> None:
     inputs = th.tensor([[1.0], [math.nan], [-1.0]])
-    outputs = evaluate_perceptron(read_identity(activation()), inputs)
-    assert outputs is not None
+    outputs = identity(activation())(inputs)
     assert outputs.isnan().flatten().tolist() == [False, True, False]
 
 
@@ -68,8 +68,8 @@ def test_flow_by_solver_activation_and_path(solver: str, activation: Any, end_ti
     z, s = th.randn(37, 3), th.randn(37, 5)
     options: dict[str, Any] = {"solver": solver, "n_steps": 7, "end_time": end_time}
     with th.no_grad():
-        ours = FlowSampler(**options).carry(field, z, s)
-        close(ours, carry_plainly(field, z, s, **options))
+        ours = field.integrate(z, s, **options)
+        close(ours, integrate_plainly(field, z, s, **options))
 
 
 @pytest.mark.parametrize(("dim", "features_dim", "widths"), SHAPES)
@@ -79,25 +79,25 @@ def test_flow_by_size(dim: int, features_dim: int, widths: list[int], n_rows: in
     z, s = th.randn(n_rows, dim), th.randn(n_rows, features_dim)
     options: dict[str, Any] = {"solver": "midpoint", "n_steps": 12, "end_time": 1.0}
     with th.no_grad():
-        ours = FlowSampler(**options).carry(field, z, s)
-        close(ours, carry_plainly(field, z, s, **options))
+        ours = field.integrate(z, s, **options)
+        close(ours, integrate_plainly(field, z, s, **options))
 
 
 def test_an_action_does_not_depend_on_who_else_acts() -> None:
     """To the last bit, whatever the batch and the number of threads."""
-    field, sampler = make_field(2, 4, [256, 128, 64], nn.Mish), FlowSampler("midpoint", 12, 1.0)
+    field = make_field(2, 4, [256, 128, 64], nn.Mish)
+    options: dict[str, Any] = {"solver": "midpoint", "n_steps": 12}
     z, s = th.randn(601, 2), th.randn(601, 4)
     with th.no_grad():
-        together = sampler.carry(field, z, s)
+        together = field.integrate(z, s, **options)
         th.set_num_threads(3)
         try:
-            assert th.equal(sampler.carry(field, z, s), together)
+            assert th.equal(field.integrate(z, s, **options), together)
         finally:
             th.set_num_threads(1)
         for row in (0, 13, 600):
-            assert th.equal(
-                sampler.carry(field, z[row : row + 1], s[row : row + 1])[0], together[row]
-            )
+            alone = field.integrate(z[row : row + 1], s[row : row + 1], **options)
+            assert th.equal(alone[0], together[row])
 
 
 @pytest.mark.parametrize("embedding_dim", [1, 8, 512])
@@ -107,8 +107,8 @@ def test_flow_by_embedding(embedding_dim: int, scale: float) -> None:
     z, s = th.randn(20, 2), th.randn(20, 4)
     options: dict[str, Any] = {"solver": "midpoint", "n_steps": 12, "end_time": 1.0}
     with th.no_grad():
-        ours = FlowSampler(**options).carry(field, z, s)
-        close(ours, carry_plainly(field, z, s, **options))
+        ours = field.integrate(z, s, **options)
+        close(ours, integrate_plainly(field, z, s, **options))
 
 
 def gradients(field: nn.Module, inputs: list[th.Tensor], weights: th.Tensor) -> list[th.Tensor]:
@@ -172,15 +172,13 @@ def test_gradients_on_several_threads() -> None:
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_critic_and_gradients(activation: Any) -> None:
-    network = nn.Sequential(
+    critic = Critic(
         nn.Linear(11, 32), activation(), nn.Linear(32, 20), activation(), nn.Linear(20, 1)
     )
-    known = Reader().perceptron(network)
-    assert known is not None
+    network = critic.plain
     x = th.randn(70, 11)
     ours_x, theirs_x = x.clone().requires_grad_(), x.clone().requires_grad_()
-    ours, theirs = evaluate_perceptron(known, ours_x), network(theirs_x)
-    assert ours is not None
+    ours, theirs = critic(ours_x), network(theirs_x)
     close(ours, theirs)
     found = th.autograd.grad(ours.square().sum(), [ours_x, *network.parameters()])
     expected = th.autograd.grad(theirs.square().sum(), [theirs_x, *network.parameters()])
@@ -202,14 +200,12 @@ def test_derivatives_of_derivatives(shape: Any) -> None:
 
 
 def test_derivatives_of_derivatives_of_a_critic() -> None:
-    network = nn.Sequential(nn.Linear(3, 8), nn.Mish(), nn.Linear(8, 1))
-    known = Reader().perceptron(network)
-    assert known is not None
+    critic = Critic(nn.Linear(3, 8), nn.Mish(), nn.Linear(8, 1))
     second = []
-    for function in (lambda x: evaluate_perceptron(known, x), network):
+    for function in (critic, critic.plain):
         x = th.linspace(-1, 1, 12).view(4, 3).requires_grad_()
         (slope,) = th.autograd.grad(function(x).sum(), x, create_graph=True)
-        second.append(th.autograd.grad(slope.square().sum(), [x, network[0].weight]))
+        second.append(th.autograd.grad(slope.square().sum(), [x, *critic.plain[:2:2].parameters()]))
     for ours, theirs in zip(*second, strict=True):
         close(ours, theirs, ulps=400)
 
@@ -224,7 +220,7 @@ def test_weights_changed_between_the_two_ways_are_noticed() -> None:
 
 
 def test_numbers_of_activations_are_names_of_nothing_else() -> None:
-    kinds = [Reader().activation(activation()) for activation in ACTIVATIONS]
+    kinds = [ModuleInspector().activation(activation()) for activation in ACTIVATIONS]
     assert all(isinstance(kind, Activation) for kind in kinds)
     assert len(set(kinds)) == len(ACTIVATIONS)
     assert np.unique([kind.kind for kind in kinds if kind]).tolist() == list(range(7))

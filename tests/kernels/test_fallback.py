@@ -15,9 +15,8 @@ from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.flows import integrate
 from sb3_policyflow.kernels.compiler import note_fallback
-from sb3_policyflow.kernels.fields import FusedVelocityField
-from sb3_policyflow.kernels.sampler import FlowSampler
-from tests.kernels.plain import carry_plainly, make_field, plain_copy
+from sb3_policyflow.kernels.fields import KernelVelocityField
+from tests.kernels.plain import integrate_plainly, make_field, plain_copy
 
 OPTIONS: dict[str, Any] = {"solver": "midpoint", "n_steps": 4, "end_time": 1.0}
 
@@ -28,9 +27,9 @@ def test_other_activations(activation: Any, caplog: pytest.LogCaptureFixture) ->
     field = make_field(2, 3, [8, 8], activation)
     z, s = th.randn(6, 2), th.randn(6, 3)
     with caplog.at_level(logging.DEBUG, "sb3_policyflow"), th.no_grad():
-        ours = FlowSampler(**OPTIONS).carry(field, z, s)
-    th.testing.assert_close(ours, carry_plainly(field, z, s, **OPTIONS))
-    assert "Plain torch does the work of a fused kernel" in caplog.text
+        ours = field.integrate(z, s, **OPTIONS)
+    th.testing.assert_close(ours, integrate_plainly(field, z, s, **OPTIONS))
+    assert "Plain torch does the work of a kernel" in caplog.text
     assert all(record.levelno == logging.DEBUG for record in caplog.records)
 
 
@@ -39,10 +38,10 @@ def test_other_activations(activation: Any, caplog: pytest.LogCaptureFixture) ->
 def test_other_types_and_no_hidden_layers(widths: list[int], dtype: th.dtype) -> None:
     field = make_field(2, 3, widths).to(dtype)
     z, s = th.randn(6, 2, dtype=dtype), th.randn(6, 3, dtype=dtype)
-    ours = FlowSampler(**OPTIONS).carry(field, z, s)
+    ours = field.integrate(z, s, **OPTIONS)
     assert ours.dtype == dtype
     tolerance = 1e-12 if dtype == th.float64 else 5e-2
-    expected = carry_plainly(field, z, s, **OPTIONS)
+    expected = integrate_plainly(field, z, s, **OPTIONS)
     th.testing.assert_close(ours, expected, rtol=tolerance, atol=tolerance)
 
 
@@ -50,7 +49,7 @@ def test_gradients_through_the_flow() -> None:
     field = make_field(2, 3, [8, 8])
     plain = plain_copy(field)
     z, s = th.randn(6, 2), th.randn(6, 3)
-    ours = FlowSampler(**OPTIONS).carry(field, z, s).square().sum()
+    ours = field.integrate(z, s, **OPTIONS).square().sum()
     theirs = integrate(lambda x, t: plain(x, t, s), z, **OPTIONS).square().sum()
     for gradient, expected in zip(
         th.autograd.grad(ours, list(field.parameters())),
@@ -100,13 +99,13 @@ def test_traced_and_exported_fields_contain_their_weights() -> None:
 
 
 def test_a_subclass_has_its_own_velocity() -> None:
-    class Still(FusedVelocityField):
+    class Still(KernelVelocityField):
         def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
             return th.zeros_like(points)
 
     z = th.randn(4, 2)
     with th.no_grad():
-        assert th.equal(FlowSampler(**OPTIONS).carry(Still(2, 3, [8]), z, th.randn(4, 3)), z)
+        assert th.equal(Still(2, 3, [8]).integrate(z, th.randn(4, 3), **OPTIONS), z)
 
 
 @pytest.mark.parametrize("n_rows", [0, 3])
@@ -130,7 +129,7 @@ assert "numba" not in sys.modules, "imported with the package"
 model = PolicyFlow("MlpFlowPolicy", "Pendulum-v1", n_steps=32, batch_size=16, n_epochs=2, seed=0)
 model.learn(64)
 print(float(model.policy.parameters_to_vector().sum()))
-print("loaded", "sb3_policyflow.kernels._numba.perceptron" in sys.modules)
+print("loaded", "sb3_policyflow.kernels._numba.mlp" in sys.modules)
 """
 
 

@@ -1,6 +1,7 @@
 """However weights change, the next action is theirs."""
 
 import copy
+import itertools
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -11,12 +12,11 @@ from torch import nn
 from torch.nn.utils import parametrizations, prune
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.flows import integrate
-from sb3_policyflow.kernels.fields import FusedVelocityField
-from sb3_policyflow.kernels.sampler import FlowSampler
-from tests.kernels.plain import carry_plainly, make_field
+from sb3_policyflow.flows import SOLVERS, VelocityField, integrate
+from tests.kernels.plain import integrate_plainly, make_field
 
 OPTIONS: dict[str, Any] = {"solver": "midpoint", "n_steps": 4, "end_time": 1.0}
+GLOROT = {"initialization": "glorot"}
 Z, S = th.linspace(-1, 1, 10).view(5, 2), th.linspace(-2, 1, 15).view(5, 3)
 
 
@@ -131,19 +131,19 @@ CHANGES: list[Callable[[Any], None]] = [
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_every_change_is_seen(change: Callable[[Any], None]) -> None:
-    field, sampler = make_field(2, 3, [8, 8], nn.Tanh), FlowSampler(**OPTIONS)
+    field = make_field(2, 3, [8, 8], nn.Tanh)
     with th.no_grad():
-        before = sampler.carry(field, Z, S)
-        assert th.equal(sampler.carry(field, Z, S), before)
+        before = field.integrate(Z, S, **OPTIONS)
+        assert th.equal(field.integrate(Z, S, **OPTIONS), before)
     change(field)
     with th.no_grad():
-        after = sampler.carry(field, Z, S)
+        after = field.integrate(Z, S, **OPTIONS)
         th.testing.assert_close(after, reference(field), rtol=1e-5, atol=1e-5)
     if change is not sign_of_zero_and_back:
         assert not th.allclose(after, before, atol=1e-4)
 
 
-def reference(field: FusedVelocityField) -> th.Tensor:
+def reference(field: VelocityField) -> th.Tensor:
     """End points by the modules themselves, called one by one."""
 
     def velocity(x: th.Tensor, t: th.Tensor) -> th.Tensor:
@@ -155,56 +155,70 @@ def reference(field: FusedVelocityField) -> th.Tensor:
 
 
 def test_shapes_that_change_under_the_same_parameters() -> None:
-    field, sampler = make_field(2, 3, [8, 8]), FlowSampler(**OPTIONS)
+    field = make_field(2, 3, [8, 8])
     with th.no_grad():
-        sampler.carry(field, Z, S)
+        field.integrate(Z, S, **OPTIONS)
         grow(field)
-        th.testing.assert_close(sampler.carry(field, Z, S), reference(field))
+        th.testing.assert_close(field.integrate(Z, S, **OPTIONS), reference(field))
 
 
 @pytest.mark.parametrize("wrap", [prune.random_unstructured, parametrizations.weight_norm])
 def test_reparametrized_layers(wrap: Any) -> None:
-    field, sampler = make_field(2, 3, [8, 8]), FlowSampler(**OPTIONS)
+    field = make_field(2, 3, [8, 8])
     with th.no_grad():
-        sampler.carry(field, Z, S)
+        field.integrate(Z, S, **OPTIONS)
     arguments = {"amount": 0.5} if wrap is prune.random_unstructured else {}
     wrap(field.hidden[2], name="weight", **arguments)
     with th.no_grad():
-        th.testing.assert_close(sampler.carry(field, Z, S), reference(field))
+        th.testing.assert_close(field.integrate(Z, S, **OPTIONS), reference(field))
 
 
 def test_a_hook_sees_and_changes_what_passes() -> None:
-    field, sampler = make_field(2, 3, [8, 8]), FlowSampler(**OPTIONS)
+    field = make_field(2, 3, [8, 8])
     with th.no_grad():
-        before = sampler.carry(field, Z, S)
+        before = field.integrate(Z, S, **OPTIONS)
         handle = field.hidden[1].register_forward_hook(lambda _m, _i, output: 2 * output)
-        hooked = sampler.carry(field, Z, S)
+        hooked = field.integrate(Z, S, **OPTIONS)
         th.testing.assert_close(hooked, reference(field))
         assert not th.allclose(hooked, before)
         handle.remove()
-        assert th.equal(sampler.carry(field, Z, S), before)
+        assert th.equal(field.integrate(Z, S, **OPTIONS), before)
 
 
 def test_copies_go_their_own_way() -> None:
-    field, sampler = make_field(2, 3, [8, 8]), FlowSampler(**OPTIONS)
+    field = make_field(2, 3, [8, 8])
     with th.no_grad():
-        before = sampler.carry(field, Z, S)
-        twins = [copy.deepcopy((field, sampler)), pickle.loads(pickle.dumps((field, sampler)))]
+        before = field.integrate(Z, S, **OPTIONS)
+        twins = [copy.deepcopy(field), pickle.loads(pickle.dumps(field))]
         field.output.bias.add_(1.0)
-        sampler.carry(field, Z, S)
-        for twin, its_sampler in twins:
-            assert th.equal(its_sampler.carry(twin, Z, S), before)
+        field.integrate(Z, S, **OPTIONS)
+        for twin in twins:
+            assert th.equal(twin.integrate(Z, S, **OPTIONS), before)
             twin.output.bias.add_(2.0)
-            after = its_sampler.carry(twin, Z, S)
-            th.testing.assert_close(after, carry_plainly(twin, Z, S, **OPTIONS))
+            after = twin.integrate(Z, S, **OPTIONS)
+            th.testing.assert_close(after, integrate_plainly(twin, Z, S, **OPTIONS))
 
 
-def test_one_sampler_serves_two_fields_in_turn() -> None:
-    fields, sampler = [make_field(2, 3, [8, 8]) for _ in range(2)], FlowSampler(**OPTIONS)
+def test_one_field_serves_many_solvers_in_turn() -> None:
+    """What is kept for one solver is not taken for another, and follows the weights too."""
+    field = make_field(2, 3, [8, 8])
+    choices = itertools.product(SOLVERS, (1, 3), (1.0, 1.5))
+    all_options = [dict(zip(OPTIONS, choice, strict=True)) for choice in choices]
     with th.no_grad():
-        for field in fields * 2:
-            ours = sampler.carry(field, Z, S)
-            th.testing.assert_close(ours, carry_plainly(field, Z, S, **OPTIONS))
+        for _ in range(3):
+            for options in [*all_options, *all_options[-2:]]:
+                ours = field.integrate(Z, S, **options)
+                th.testing.assert_close(ours, integrate_plainly(field, Z, S, **options))
+            field.output.weight.add_(0.1)
+
+
+def test_a_policy_whose_steps_are_changed_takes_as_many_at_once() -> None:
+    policy = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=GLOROT).policy
+    observation = policy.observation_space.sample()
+    actions = []
+    for policy.n_flow_steps in (12, 1, 12):
+        actions.append(policy.predict(observation, deterministic=True)[0].item())
+    assert actions[0] == actions[2] != actions[1]
 
 
 def test_a_loaded_and_a_changed_model(tmp_path: Any) -> None:

@@ -13,10 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
-from sb3_policyflow.kernels.compiler import kernels
-from sb3_policyflow.kernels.networks import Reader
-from sb3_policyflow.kernels.perceptron import evaluate_perceptron
-from tests.kernels.plain import make_field
+from sb3_policyflow.kernels.compiler import SWITCH, load_kernels
+from tests.kernels.plain import Critic, make_field
 from tests.resilience.test_collection import Clock
 
 MISH = {"net_arch": [32, 16], "activation_fn": th.nn.Mish, "initialization": "glorot"}
@@ -48,7 +46,7 @@ def test_one_update(
 ) -> None:
     fused = train(algorithm, **options)
     request.getfixturevalue("no_kernels")
-    assert kernels() is None
+    assert load_kernels() == f"{SWITCH} is 0"
     th.testing.assert_close(fused, train(algorithm, **options), rtol=0, atol=2e-5)
 
 
@@ -146,15 +144,12 @@ def field_evaluation() -> th.Tensor:
     return velocity
 
 
-def perceptron_evaluation() -> th.Tensor:
-    network = Reader().perceptron([th.nn.Linear(2, 8), th.nn.Tanh(), th.nn.Linear(8, 1)])
-    assert network is not None
-    outputs = evaluate_perceptron(network, th.randn(5, 2))
-    assert outputs is not None
-    return outputs
+def critic_evaluation() -> th.Tensor:
+    values: th.Tensor = Critic(th.nn.Linear(2, 8), th.nn.Tanh(), th.nn.Linear(8, 1))(th.randn(5, 2))
+    return values
 
 
-@pytest.mark.parametrize("evaluate", [field_evaluation, perceptron_evaluation])
+@pytest.mark.parametrize("evaluate", [field_evaluation, critic_evaluation])
 def test_nothing_outlives_the_graph(evaluate: Any) -> None:
     """A cycle of references would hold what each minibatch has kept for the way back."""
     gc.collect()
@@ -162,17 +157,17 @@ def test_nothing_outlives_the_graph(evaluate: Any) -> None:
     try:
         outputs = evaluate()
         node: Any = outputs.grad_fn
-        while not hasattr(node, "way"):
+        while not hasattr(node, "evaluation"):
             node = node.next_functions[0][0]
-        way = weakref.ref(node.way)
-        assert way() is not None
+        evaluation = weakref.ref(node.evaluation)
+        assert evaluation() is not None
         del outputs, node
-        assert way() is None
+        assert evaluation() is None
     finally:
         gc.enable()
 
 
-@pytest.mark.parametrize("evaluate", [field_evaluation, perceptron_evaluation])
+@pytest.mark.parametrize("evaluate", [field_evaluation, critic_evaluation])
 def test_what_was_kept_is_given_back_after_the_way_back(evaluate: Any) -> None:
     loss = evaluate().sum()
     loss.backward()

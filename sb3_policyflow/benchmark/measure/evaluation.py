@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_policyflow.benchmark.measure.seeding import seeded
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.common.policies import FlowPolicy
 
 EVALUATION_SEED = 1_000_000
 """Far from the seeds of trainings; every evaluation starts from the same states."""
@@ -23,7 +23,7 @@ MODES = (STOCHASTIC, LATENT_ONLY, DETERMINISTIC)
 
 def modes(model: BaseAlgorithm) -> tuple[str, ...]:
     """How a model can act: with all its randomness, with that of its latents only, with none."""
-    if isinstance(model.policy, FlowActorCriticPolicy):
+    if isinstance(model.policy, FlowPolicy):
         return STOCHASTIC, LATENT_ONLY, DETERMINISTIC
     return STOCHASTIC, DETERMINISTIC
 
@@ -33,7 +33,7 @@ def _random_latents_enabled(model: BaseAlgorithm, mode: str) -> Iterator[None]:
     if mode != LATENT_ONLY:
         yield
         return
-    assert isinstance(model.policy, FlowActorCriticPolicy)
+    assert isinstance(model.policy, FlowPolicy)
     before, model.policy.random_latents = model.policy.random_latents, True
     try:
         yield

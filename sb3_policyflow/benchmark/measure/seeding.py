@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch as th
 
-from sb3_policyflow.resilience.saving import random_states_kept
+from sb3_policyflow.resilience.saving import preserve_rng_state
 
 
 @contextmanager
@@ -16,7 +16,7 @@ def seeded(seed: int, device: th.device | str = "cpu") -> Iterator[None]:
     :param seed: Seed of torch's and numpy's generators.
     :param device: Where draws are made, whose generator is put back too.
     """
-    with random_states_kept(th.device(device)):
+    with preserve_rng_state(th.device(device)):
         th.manual_seed(seed)
         np.random.seed(seed)
         yield

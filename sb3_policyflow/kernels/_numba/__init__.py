@@ -2,22 +2,20 @@
 
 They take arrays of float32, read parameters where they are in memory, and carry few enough rows at
 a time through a network to stay in the caches. Get them from
-:func:`sb3_policyflow.kernels.compiler.kernels`.
+:func:`sb3_policyflow.kernels.compiler.load_kernels`.
 """
 
 from sb3_policyflow.kernels._numba.embedding import embed, embed_backward
-from sb3_policyflow.kernels._numba.flow import Method, Network, flow
-from sb3_policyflow.kernels._numba.memory import clip, renew
-from sb3_policyflow.kernels._numba.perceptron import backward, forward
+from sb3_policyflow.kernels._numba.flow import flow
+from sb3_policyflow.kernels._numba.memory import clip, update_copy
+from sb3_policyflow.kernels._numba.mlp import backward, forward
 
 __all__ = [
-    "Method",
-    "Network",
     "backward",
     "clip",
     "embed",
     "embed_backward",
     "flow",
     "forward",
-    "renew",
+    "update_copy",
 ]

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sb3_policyflow.kernels._numba.options import F, Floats, exact
+from sb3_policyflow.kernels._numba.options import F, exact
 from sb3_policyflow.kernels.activations import ELU, LEAKY_RELU, MISH, RELU, SILU, TANH
+from sb3_policyflow.kernels.layouts import Floats
 
 
 @exact
@@ -99,8 +100,8 @@ def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # on
 
 
 @exact
-def activate_with_slopes(  # noqa: C901  # one loop for each
-    kind: int, alpha: Any, values: Floats, slopes: Floats
+def activate_with_derivatives(  # noqa: C901  # one loop for each
+    kind: int, alpha: Any, values: Floats, derivatives: Floats
 ) -> None:
     """Apply an activation in place, and keep its derivatives.
 
@@ -110,31 +111,31 @@ def activate_with_slopes(  # noqa: C901  # one loop for each
         for i in range(values.size):
             u, w, inverse = _mish_parts(values[i])
             gate = w * inverse
-            slopes[i] = gate + F(4.0) * values[i] * (u * (u + F(1.0)) * inverse) * inverse
+            derivatives[i] = gate + F(4.0) * values[i] * (u * (u + F(1.0)) * inverse) * inverse
             values[i] *= gate
     elif kind == TANH:
         for i in range(values.size):
             values[i] = _tanh(values[i])
-            slopes[i] = F(1.0) - values[i] * values[i]
+            derivatives[i] = F(1.0) - values[i] * values[i]
     elif kind == RELU:
         for i in range(values.size):
-            slopes[i] = F(0.0) if values[i] <= F(0.0) else F(1.0)
+            derivatives[i] = F(0.0) if values[i] <= F(0.0) else F(1.0)
             values[i] = F(0.0) if values[i] < F(0.0) else values[i]
     elif kind == LEAKY_RELU:
         for i in range(values.size):
-            slopes[i] = F(1.0) if values[i] > F(0.0) else alpha
+            derivatives[i] = F(1.0) if values[i] > F(0.0) else alpha
             values[i] = alpha * values[i] if values[i] < F(0.0) else values[i]
     elif kind == SILU:
         for i in range(values.size):
             gate = _sigmoid(values[i])
-            slopes[i] = gate * (F(1.0) + values[i] * (F(1.0) - gate))
+            derivatives[i] = gate * (F(1.0) + values[i] * (F(1.0) - gate))
             values[i] *= gate
     elif kind == ELU:
         for i in range(values.size):
             y = _elu(values[i], alpha)
-            slopes[i] = F(1.0) if values[i] > F(0.0) else y + alpha
+            derivatives[i] = F(1.0) if values[i] > F(0.0) else y + alpha
             values[i] = y
     else:
         for i in range(values.size):
             values[i] = _sigmoid(values[i])
-            slopes[i] = values[i] * (F(1.0) - values[i])
+            derivatives[i] = values[i] * (F(1.0) - values[i])

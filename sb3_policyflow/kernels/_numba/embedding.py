@@ -4,10 +4,11 @@ table = (MLP(cos, sin of 2 pi f t) + b_o) W_e^T + b,    shifts = features (W_e W
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
-from sb3_policyflow.kernels._numba.activations import activate_with_slopes
+from sb3_policyflow.kernels._numba.activations import activate_with_derivatives
 from sb3_policyflow.kernels._numba.matrices import (
     accumulate,
     add,
@@ -18,12 +19,20 @@ from sb3_policyflow.kernels._numba.matrices import (
     transposed,
 )
 from sb3_policyflow.kernels._numba.memory import matrix, vector
-from sb3_policyflow.kernels._numba.options import F, Floats, Integers, inner, kernel
+from sb3_policyflow.kernels._numba.options import F, inner, kernel
+from sb3_policyflow.kernels.layouts import (
+    FieldGradients,
+    FieldLayout,
+    FirstLayerGradients,
+    Floats,
+    Integers,
+    TimeLayers,
+)
 
 
 @inner
-def _tell_apart(times: Floats, index: Integers) -> int:
-    """Move each distinct time to the front; fill the index of each time; count the distinct."""
+def _deduplicate(times: Floats, entries: Integers) -> int:
+    """Move the distinct times to the front, fill the entry of each time, and count the distinct."""
     bits = times.view(np.int32)
     size = 64
     while size < 2 * times.size:
@@ -38,7 +47,7 @@ def _tell_apart(times: Floats, index: Integers) -> int:
             slots[slot] = count
             times[count] = times[row]
             count += 1
-        index[row] = slots[slot]
+        entries[row] = slots[slot]
     return count
 
 
@@ -66,49 +75,42 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> No
 @kernel
 def embed(
     times: Floats,
-    index: Integers,
-    n_frequencies: int,
+    entries: Integers,
     features: Floats,
-    addresses: Integers,
-    dim: int,
-    kind: int,
-    alpha: float,
-    kept: Floats,
+    field: FieldLayout,
+    saved: TimeLayers,
     table: Floats,
     shifts: Floats,
 ) -> int:
     """Evaluate the table of times and the shifts of observations.
 
     :param times: shape (n_times,); the distinct ones are moved to the front.
-    :param index: Filled with the entry of the table for each time, shape (n_times,).
-    :param n_frequencies: Frequencies of the time embedding.
+    :param entries: Filled with the entry of the table for each time, shape (n_times,).
     :param features: shape (m, n_features).
-    :param addresses: Of the frequencies, of weight and bias of the time embedding's two layers, of
-        the observation embedding, and of the field's first layer.
-    :param dim: Dimensions of the points, the first columns of the first layer's weight.
-    :param kind: Activation of the time embedding.
-    :param alpha: Its parameter.
-    :param kept: Filled with the time embedding's hidden layer, its slopes, and the embeddings plus
-        b_o, shape (3, n_times, size).
+    :param field: The embeddings and the first layer.
+    :param saved: Filled with the layers of the time embedding.
     :param table: Filled; shape (n_times, width).
     :param shifts: Filled; shape (m, width).
     :return: How many distinct times, and entries of the table, there are.
     """
-    n = _tell_apart(times, index)
-    size, width = kept.shape[2], table.shape[1]
-    hidden, slopes, embeddings = kept[0, :n], kept[1, :n], kept[2, :n]
-    phases = _phases(times[:n], vector(addresses[0], n_frequencies))
-    weights = transposed(matrix(addresses[1], size, 2 * n_frequencies))
-    _layer(phases, weights, vector(addresses[2], size), hidden)
-    activate_with_slopes(kind, F(alpha), hidden.reshape(-1), slopes.reshape(-1))
-    weights = transposed(matrix(addresses[3], size, size))
-    _layer(hidden, weights, vector(addresses[4], size), embeddings)
+    n, dim = _deduplicate(times, entries), field.dim
+    size, width = saved.hidden.shape[1], table.shape[1]
+    hidden, derivatives = saved.hidden[:n], saved.derivatives[:n]
+    embeddings = saved.embeddings[:n]
+    phases = _phases(times[:n], vector(field.frequencies, field.n_frequencies))
+    weights = transposed(matrix(field.time_hidden_weight, size, 2 * field.n_frequencies))
+    _layer(phases, weights, vector(field.time_hidden_bias, size), hidden)
+    activate_with_derivatives(
+        field.kind, F(field.alpha), hidden.reshape(-1), derivatives.reshape(-1)
+    )
+    weights = transposed(matrix(field.time_output_weight, size, size))
+    _layer(hidden, weights, vector(field.time_output_bias, size), embeddings)
     for row in range(n):
-        add(vector(addresses[6], size), embeddings[row])
-    first = transposed(matrix(addresses[7], width, dim + size))[dim:]
-    _layer(embeddings, first, vector(addresses[8], width), table[:n])
+        add(vector(field.observation_bias, size), embeddings[row])
+    first = transposed(matrix(field.first_weight, width, dim + size))[dim:]
+    _layer(embeddings, first, vector(field.first_bias, width), table[:n])
     clear(shifts)
-    observation = matrix(addresses[5], size, features.shape[1])
+    observation = matrix(field.observation_weight, size, features.shape[1])
     accumulate(features, product(observation.T, first), shifts)
     return n
 
@@ -116,71 +118,68 @@ def embed(
 @kernel
 def embed_backward(
     times: Floats,
-    n_frequencies: int,
     features: Floats,
-    addresses: Integers,
-    dim: int,
-    kept: Floats,
-    grad_points: Floats,
-    grad_table: Floats,
-    grad_shifts: Floats,
-    grads: Floats,
-    grad_features: Floats,
+    field: FieldLayout,
+    saved: TimeLayers,
+    first: FirstLayerGradients,
+    gradients: FieldGradients,
 ) -> None:
     """Gradients of what :func:`embed` takes.
 
-    :param times: The distinct times.
-    :param grad_points: Of the first layer's weights of the points, shape (dim, width).
-    :param grads: Filled in the order of the addresses behind the first, flat.
-    :param grad_features: Filled; shape (m, n_features), or empty.
-
-    For the others see :func:`embed`.
+    :param times: The distinct times, shape (n_times,).
+    :param features: shape (m, n_features).
+    :param field: The embeddings and the first layer.
+    :param saved: What :func:`embed` saved.
+    :param first: The gradients of the first layer.
+    :param gradients: Filled.
     """
-    n, width, size, n_features = times.size, grad_table.shape[1], kept.shape[2], features.shape[1]
-    hidden, slopes, embeddings = kept[0, :n], kept[1, :n], kept[2, :n]
-    first = matrix(addresses[7], width, dim + size)
+    n, dim, (width, n_inputs) = times.size, field.dim, gradients.first_weight.shape
+    size, n_features = n_inputs - dim, features.shape[1]
+    hidden, derivatives = saved.hidden[:n], saved.derivatives[:n]
+    embeddings = saved.embeddings[:n]
+    first_weight = matrix(field.first_weight, width, n_inputs)
     of_embedding = np.empty((width, size), F)
     for row in range(width):
-        copy(first[row, dim:], of_embedding[row])
-    observation = transposed(matrix(addresses[5], size, n_features))
-    grad_folded = product(features.T, grad_shifts)
-    grad_of_embedding = product(grad_table.T, embeddings)
+        copy(first_weight[row, dim:], of_embedding[row])
+    observation = transposed(matrix(field.observation_weight, size, n_features))
+    grad_folded = product(features.T, first.shifts)
+    grad_of_embedding = product(first.table.T, embeddings)
     accumulate(grad_folded.T, observation, grad_of_embedding)
-    grad_embeddings = product(grad_table, of_embedding)
-    grad_hidden = product(grad_embeddings, matrix(addresses[3], size, size))
-    multiply(grad_hidden.reshape(-1), slopes.reshape(-1))
-    if grad_features.shape[0] > 0:
-        clear(grad_features)
+    grad_embeddings = product(first.table, of_embedding)
+    grad_hidden = product(grad_embeddings, matrix(field.time_output_weight, size, size))
+    multiply(grad_hidden.reshape(-1), derivatives.reshape(-1))
+    if gradients.features.shape[0] > 0:
+        clear(gradients.features)
         folded = product(observation, transposed(of_embedding))
-        accumulate(grad_shifts, transposed(folded), grad_features)
+        accumulate(first.shifts, transposed(folded), gradients.features)
 
-    phases = _phases(times, vector(addresses[0], n_frequencies))
-    end = _put(product(grad_hidden.T, phases), grads, 0)
-    end = _put_sums(grad_hidden, grads, end)
-    end = _put(product(grad_embeddings.T, hidden), grads, end)
-    end = _put_sums(grad_embeddings, grads, end)
-    end = _put(transposed(product(grad_folded, of_embedding)), grads, end)
-    end = _put_sums(grad_embeddings, grads, end)
+    phases = _phases(times, vector(field.frequencies, field.n_frequencies))
+    _fill_product(grad_hidden.T, phases, gradients.time_hidden_weight)
+    _fill_sums(grad_hidden, gradients.time_hidden_bias)
+    _fill_product(grad_embeddings.T, hidden, gradients.time_output_weight)
+    _fill_sums(grad_embeddings, gradients.time_output_bias)
+    copy(
+        transposed(product(grad_folded, of_embedding)).reshape(-1),
+        gradients.observation_weight.reshape(-1),
+    )
+    copy(gradients.time_output_bias, gradients.observation_bias)
     for row in range(width):
         for i in range(dim):
-            grads[end + i] = grad_points[i, row]
-        copy(grad_of_embedding[row], grads[end + dim :])
-        end += dim + size
-    _put_sums(grad_table, grads, end)
+            gradients.first_weight[row, i] = first.points[i, row]
+        copy(grad_of_embedding[row], gradients.first_weight[row, dim:])
+    _fill_sums(first.table, gradients.first_bias)
 
 
 @inner
-def _put(values: Floats, target: Floats, start: int) -> int:
-    """Write a matrix; say where it ends."""
-    copy(values.reshape(-1), target[start:])
-    return start + values.size
+def _fill_product(inputs: Any, weights: Floats, outputs: Floats) -> None:
+    """Outputs = inputs @ weights."""
+    clear(outputs)
+    accumulate(inputs, weights, outputs)
 
 
 @inner
-def _put_sums(values: Floats, target: Floats, start: int) -> int:
-    """Write the sums of a matrix's columns; say where they end."""
-    end = start + values.shape[1]
-    copy(values[0], target[start:end])
+def _fill_sums(values: Floats, sums: Floats) -> None:
+    """Sums of a matrix's columns."""
+    copy(values[0], sums)
     for row in range(1, values.shape[0]):
-        add(values[row], target[start:end])
-    return end
+        add(values[row], sums)

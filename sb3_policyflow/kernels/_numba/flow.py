@@ -1,50 +1,18 @@
 """The flow from latents to end points."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sb3_policyflow.kernels._numba.matrices import accumulate, clear, copy, project
-from sb3_policyflow.kernels._numba.options import ROWS, F, Floats, Integers, inner, kernel
-from sb3_policyflow.kernels._numba.perceptron import hidden_layers, total
-
-
-class Network(NamedTuple):
-    """A velocity field whose first layer is taken apart.
-
-    Weights of the first layer for points (dim, widths[0]) and features (n_features, widths[0]);
-    what lies between first layer and output, see :func:`hidden_layers`, and the layers' widths;
-    weights (dim, widths[-1]) and biases of the output; the activation and its parameter.
-    """
-
-    points: Floats
-    features: Floats
-    hidden: Floats
-    widths: Integers
-    output: Floats
-    bias: Floats
-    kind: int
-    alpha: Any
-
-
-class Method(NamedTuple):
-    """A fixed-step solver.
-
-    Stage i of a step looks at y_i = x + sum_j a_ij k_j, and a step ends at x + sum_i b_i k_i, where
-    a and b contain the step size; a method with memory adds m (k_0 - k_0 of the step before).
-
-    What each time adds to the first layer (n_times, widths[0]); the row of this table for each step
-    and stage; and the rows a_i, b, m.
-    """
-
-    table: Floats
-    stages: Integers
-    tableau: Floats
+from sb3_policyflow.kernels._numba.mlp import hidden_layers, total
+from sb3_policyflow.kernels._numba.options import ROWS, F, inner, kernel
+from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Method
 
 
 @kernel
 def flow(
-    network: Network,
+    network: FoldedNetwork,
     method: Method,
     features: Floats,
     latents: Floats,
@@ -52,12 +20,21 @@ def flow(
     start: int,
     stop: int,
 ) -> None:
-    """Carry rows of latents to their end points, given the features of each."""
+    """Carry some rows of latents to their end points.
+
+    :param network: The velocity field.
+    :param method: The solver.
+    :param features: shape (n, n_features).
+    :param latents: shape (n, dim).
+    :param endpoints: Filled; shape (n, dim).
+    :param start: The first row.
+    :param stop: The row behind the last.
+    """
     width, dim, n_values = network.widths[0], latents.shape[1], total(network.widths)
     values = np.empty(ROWS * n_values, F)
     shifts = np.empty((ROWS, width), F)
-    slopes = np.empty((method.stages.shape[1], ROWS, dim), F)
-    spare = np.empty((2, ROWS, dim), F)
+    stages = np.empty((method.time_indices.shape[1], ROWS, dim), F)
+    scratch = np.empty((2, ROWS, dim), F)
     for begin in range(start, stop, ROWS):
         end = min(begin + ROWS, stop)
         rows = end - begin
@@ -71,38 +48,38 @@ def flow(
             shifts[:rows],
             endpoints[begin:end],
             values[: rows * n_values],
-            slopes[:, :rows],
-            spare[:, :rows],
+            stages[:, :rows],
+            scratch[:, :rows],
         )
 
 
 @inner
 def _integrate(
-    network: Network,
+    network: FoldedNetwork,
     method: Method,
     shifts: Floats,
     points: Floats,
     values: Floats,
-    slopes: Any,
-    spare: Any,
+    stages: Any,
+    scratch: Any,
 ) -> None:
     """Carry a block of points, in place."""
-    n_steps, n_stages = method.stages.shape
-    looked, previous = spare[0], spare[1]
+    n_steps, n_stages = method.time_indices.shape
+    stage_points, previous = scratch[0], scratch[1]
     memory = method.tableau[n_stages + 1, 0]
     for step in range(n_steps):
         for stage in range(n_stages):
-            _combine(points, slopes[:stage], method.tableau[stage], looked)
-            time_shift = method.table[method.stages[step, stage]]
-            _velocity(network, looked, shifts, time_shift, values, slopes[stage])
-        _combine(points, slopes, method.tableau[n_stages], points)
+            _combine(points, stages[:stage], method.tableau[stage], stage_points)
+            time_shift = method.table[method.time_indices[step, stage]]
+            _velocity(network, stage_points, shifts, time_shift, values, stages[stage])
+        _combine(points, stages, method.tableau[n_stages], points)
         if memory != F(0.0):
-            _remember(points, slopes[0], previous, memory if step > 0 else F(0.0))
+            _remember(points, stages[0], previous, memory if step > 0 else F(0.0))
 
 
 @inner
 def _velocity(
-    network: Network,
+    network: FoldedNetwork,
     points: Floats,
     shifts: Floats,
     time_shift: Floats,
@@ -123,23 +100,23 @@ def _velocity(
 
 
 @inner
-def _combine(points: Floats, slopes: Any, weights: Floats, outputs: Floats) -> None:
-    """Outputs = points + the weighted sum of the slopes."""
+def _combine(points: Floats, stages: Any, weights: Floats, outputs: Floats) -> None:
+    """Outputs = points + the weighted sum of the stages."""
     for row in range(points.shape[0]):
         for i in range(points.shape[1]):
             x = points[row, i]
-            for j in range(slopes.shape[0]):
+            for j in range(stages.shape[0]):
                 # Zero times infinity is not a number.
                 if weights[j] != F(0.0):
-                    x += weights[j] * slopes[j, row, i]
+                    x += weights[j] * stages[j, row, i]
             outputs[row, i] = x
 
 
 @inner
-def _remember(points: Floats, slopes: Any, previous: Any, memory: Any) -> None:
-    """Points += memory * (slopes - previous), and the slopes are the next previous ones."""
+def _remember(points: Floats, stage: Any, previous: Any, memory: Any) -> None:
+    """Points += memory * (stage - previous), and copy the stage for the next step."""
     for row in range(points.shape[0]):
         for i in range(points.shape[1]):
             if memory != F(0.0):
-                points[row, i] += memory * (slopes[row, i] - previous[row, i])
-            previous[row, i] = slopes[row, i]
+                points[row, i] += memory * (stage[row, i] - previous[row, i])
+            previous[row, i] = stage[row, i]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_policyflow.kernels._numba.options import F, Floats, inner
+from sb3_policyflow.kernels._numba.options import F, inner
 from sb3_policyflow.kernels._numba.tiles import (
     LONG,
     TALL,
@@ -16,6 +16,7 @@ from sb3_policyflow.kernels._numba.tiles import (
     tall_slim,
     tall_wide,
 )
+from sb3_policyflow.kernels.layouts import Floats
 
 
 @inner

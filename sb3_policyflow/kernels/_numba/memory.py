@@ -8,7 +8,8 @@ from numba import carray, types
 from numba.extending import intrinsic
 
 from sb3_policyflow.kernels._numba.matrices import copy as copy_numbers
-from sb3_policyflow.kernels._numba.options import Bits, F, Floats, Integers, inner, kernel
+from sb3_policyflow.kernels._numba.options import F, inner, kernel
+from sb3_policyflow.kernels.layouts import Bits, Floats, Integers
 
 
 def _pointer_to(number: Any) -> Any:
@@ -23,7 +24,7 @@ def _pointer_to(number: Any) -> Any:
     return intrinsic(pointer)
 
 
-GREATEST = float(np.finfo(np.float32).max)
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 _floats = _pointer_to(types.float32)
 _bits = _pointer_to(types.int32)
@@ -42,7 +43,7 @@ def matrix(address: int, n_rows: int, n_columns: int) -> Floats:
 
 
 @kernel
-def renew(addresses: Integers, sizes: Integers, copy: Bits) -> bool:
+def update_copy(addresses: Integers, sizes: Integers, copy: Bits) -> bool:
     """Copy the numbers at some addresses one behind the other; say whether a bit has changed."""
     changed = False
     start = 0
@@ -75,7 +76,7 @@ def clip(addresses: Integers, sizes: Integers, max_norm: float) -> float:
         for i in range(numbers.size):
             squares += np.float64(numbers[i]) * np.float64(numbers[i])
         total += squares
-    norm = math.sqrt(total) if total <= GREATEST else np.inf
+    norm = math.sqrt(total) if total <= FLOAT32_MAX else np.inf
     factor = F(max_norm / (norm + 1e-6))
     if factor < F(1.0) and norm < np.inf:
         for place in range(addresses.size):

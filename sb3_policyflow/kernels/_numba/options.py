@@ -4,11 +4,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
-Bits = NDArray[np.int32]
 
 F = np.float32
 ROWS = 16

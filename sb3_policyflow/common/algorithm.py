@@ -1,0 +1,322 @@
+"""The update that all flow algorithms share: PPO's, for policies without a likelihood."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
+
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.buffers import (
+    DictFlowRolloutBuffer,
+    FlowRolloutBuffer,
+    FlowRolloutBufferSamples,
+)
+from sb3_policyflow.common.checks import Check
+from sb3_policyflow.common.losses import clipped_value_loss, normalize
+from sb3_policyflow.common.optimization import clip_gradients
+from sb3_policyflow.common.options import (
+    FORMER_NAMES,
+    SHARED_CHECKS,
+    check_algorithm,
+    read_loaded_options,
+)
+from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
+from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics
+from sb3_policyflow.kernels import reason_kernels_are_off
+from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
+
+SelfFlow = TypeVar("SelfFlow", bound="FlowOnPolicyAlgorithm")
+
+
+class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
+    """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
+
+    Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
+    supported, ``max_grad_norm`` may be None or not positive for no clipping, and ``ent_coef`` may
+    be a schedule; and:
+
+    :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
+        a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
+        follow ``learning_rate``.
+    :param lr_adaptation_kwargs: Options of the adaptive learning rate, those of
+        :class:`~sb3_policyflow.common.schedules.KLAdaptiveLearningRate`.
+    :param advantage_scope: Where advantages are normalized: in each "minibatch", as SB3 does, or
+        over the whole "rollout".
+    :param timeout_bootstrap: The value with which an episode cut by a time limit continues: that of
+        the "terminal" observation, as in SB3, of the "current" one before it, or "none".
+    :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
+        arguments of its policy class. They may be given in ``policy_kwargs`` instead.
+    :raises ValueError: If an argument cannot be used.
+    """
+
+    policy_base: ClassVar[type[FlowPolicy]]
+    former_names: ClassVar[Mapping[str, str]] = FORMER_NAMES
+    """Present names of options by former ones."""
+    divergence_advice: ClassVar[str] = ""
+    """What else than a lower learning rate helps against gradients that are not finite."""
+    option_checks: ClassVar[Mapping[str, Check]] = SHARED_CHECKS
+    model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
+    """Functions that refuse a model whose options do not go together."""
+
+    trust_region: str = "ppo"
+    policy: FlowPolicy
+    rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
+
+    def __init__(
+        self,
+        policy: str | type[FlowPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: Coefficient = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float | None = 0.5,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        desired_kl: Coefficient | None = None,
+        lr_adaptation_kwargs: dict[str, Any] | None = None,
+        advantage_scope: str = "minibatch",
+        timeout_bootstrap: str = "terminal",
+        **policy_options: Any,
+    ) -> None:
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.clip_range = clip_range
+        self.clip_range_vf = clip_range_vf
+        self.normalize_advantage = normalize_advantage
+        self.target_kl = target_kl
+        self.desired_kl = desired_kl
+        self.lr_adaptation_kwargs = lr_adaptation_kwargs
+        self.advantage_scope = advantage_scope
+        self.timeout_bootstrap = timeout_bootstrap
+        self.policy_options = policy_options
+        self.adaptive_learning_rate: float | None = None
+        self._adaptive_start: float | None = None
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,  # type: ignore[arg-type]  # may be a schedule here
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]  # None turns clipping off
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        read_loaded_options(self)
+        check_algorithm(self)
+        self.rollout_buffer_class = checks.choose_buffer_class(
+            type(self).__name__, self.rollout_buffer_class, self.observation_space
+        )
+        policy_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**policy_kwargs, **self.policy_options}
+        super()._setup_model()
+        self.policy_kwargs = policy_kwargs
+        self.clip_range = FloatSchedule(self.clip_range)
+        if self.clip_range_vf is not None:
+            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        start = self.lr_schedule(1.0)
+        if self.desired_kl is None:
+            self.adaptive_learning_rate = None
+        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
+            # Otherwise a saved run continues that began with this learning rate.
+            self.adaptive_learning_rate = start
+        self._adaptive_start = start
+        for check in self.model_checks:
+            check(self)
+
+    def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
+        super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
+
+    def value_of(self, name: str) -> float:
+        """The value of an option that may be a schedule, at the present progress.
+
+        :param name: The option, such as "ent_coef".
+        """
+        schedule = parse_schedule(name, getattr(self, name))
+        return float(schedule(self._current_progress_remaining))
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may end beyond total_timesteps, where SB3's value is negative and a
+        # linear schedule with it: a negative learning rate would ascend the loss.
+        self._current_progress_remaining = max(0.0, self._current_progress_remaining)
+
+    def _update_learning_rate(
+        self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
+    ) -> None:
+        if self.adaptive_learning_rate is None:
+            super()._update_learning_rate(optimizers)
+            return
+        self.logger.record("train/learning_rate", self.adaptive_learning_rate)
+        update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
+
+    def _adapt_learning_rate(
+        self, rule: KLAdaptiveLearningRate, kls: list[th.Tensor], trains_actor: bool
+    ) -> None:
+        """Move the learning rate, if it is adaptive, by the mean of some divergences."""
+        # An actor that does not learn gives no reason to learn faster.
+        if self.adaptive_learning_rate is None or not trains_actor:
+            return
+        self.adaptive_learning_rate = rule.adapt(
+            self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
+        )
+        update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
+
+    # The update
+
+    @abstractmethod
+    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> FlowUpdate:
+        """The algorithm's part of the update of a rollout, before the policy changes.
+
+        :param rollout: The whole rollout of n samples.
+        """
+
+    def train(self) -> None:
+        """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
+        rollout = self.rollout_buffer.samples()
+        rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
+        self.policy.set_training_mode(False)
+        update = self._begin_update(rollout)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
+        parameters = list(self.policy.parameters())
+        rule = KLAdaptiveLearningRate.of("lr_adaptation_kwargs", self.lr_adaptation_kwargs)
+        metrics, kls = UpdateMetrics(), list[th.Tensor]()
+        for _ in range(self.n_epochs):  # line 13
+            kls = [] if rule.window == "epoch" else kls
+            samples = rollout._replace(drawn=update.draw(rollout))  # lines 15 to 17
+            self.policy.set_training_mode(True)
+            for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
+                features, critic_features = self.policy.actor_critic_features(batch.observations)
+                terms = update.terms(batch, features)  # lines 18, 20 and 21
+                # Surrogate objective within the trust region
+                advantages = self._normalized(batch.advantages, "minibatch")
+                policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
+                # Value loss, against the TD(lambda) returns
+                values = self.policy.values(critic_features).flatten()
+                value_loss = clipped_value_loss(
+                    values, batch.old_values, batch.returns, clip_range_vf
+                )
+                # The entropy bonuses are part of the regularizer
+                loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
+                metrics.add_means({"policy_gradient_loss": policy_loss, "value_loss": value_loss})
+                metrics.add_means(terms.metrics)
+                kls.append(terms.kl.detach())
+                stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
+                if not stop:
+                    self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
+                if stop or rule.interval == "minibatch":
+                    self._adapt_learning_rate(rule, kls[-1:], update.trains_actor)
+                if stop:
+                    self.logger.info(f"Early stopping due to reaching max kl: {kls[-1].item():.2f}")
+                    break
+            self._n_updates += 1
+            if stop:
+                break
+            if rule.interval == "epoch":
+                self._adapt_learning_rate(rule, kls, update.trains_actor)
+        self._log_update(loss, th.stack(kls).mean(), metrics)
+
+    def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
+        """Advantages, shape (n,), normalized if this is the scope in which that is done."""
+        # One sample has no standard deviation.
+        if self.normalize_advantage and self.advantage_scope == scope and len(advantages) > 1:
+            return normalize(advantages)
+        return advantages
+
+    def _optimize(
+        self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
+    ) -> None:
+        """Take one step of the optimizer.
+
+        :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
+        """
+        for parameter in parameters:
+            parameter.grad = None
+        trained = None if trains_actor else list(self.policy.critic_parameters())
+        th.autograd.backward(loss, inputs=trained)
+        clips = self.max_grad_norm is not None and self.max_grad_norm > 0
+        norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
+        if not (math.isfinite(norm) and th.isfinite(loss)):
+            what = "gradient" if th.isfinite(loss) else "loss"
+            raise FloatingPointError(
+                f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
+                "The parameters are those of the last good step and can be saved: lower the "
+                f"learning rate{self.divergence_advice}."
+            )
+        self.policy.optimizer.step()
+        self.policy.keep_within_bounds()
+
+    def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
+        logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
+        logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
+        if hasattr(self.policy, "log_std"):
+            logged["std"] = self.policy.log_std.exp().mean().item()
+        logged["clip_range"] = self.value_of("clip_range")
+        if self.clip_range_vf is not None:
+            logged["clip_range_vf"] = self.value_of("clip_range_vf")
+        for name, value in {**metrics.summary(), **logged}.items():
+            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        reason = reason_kernels_are_off(self.policy)
+        if reason is not None and self.num_timesteps == 0:
+            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
+        return prepared
+
+    def learn(
+        self: SelfFlow,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFlow:
+        """Train for ``total_timesteps``; see SB3. Runs are named after the class by default."""
+        name = tb_log_name or type(self).__name__
+        return super().learn(
+            total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar
+        )

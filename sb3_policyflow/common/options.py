@@ -1,0 +1,244 @@
+"""Options of the flow algorithms: those that they share, and how a sibling adds its own to them."""
+
+import functools
+import inspect
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ParamSpec, TypedDict, cast
+
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
+
+P = ParamSpec("P")
+FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
+"""Present values of options by option and former value."""
+
+
+class FlowOptions(TypedDict, total=False):
+    """Arguments that all flow algorithms share, behind ``policy`` and ``env``.
+
+    They are documented, and have their defaults, in
+    :class:`~sb3_policyflow.common.algorithm.FlowOnPolicyAlgorithm`.
+    """
+
+    learning_rate: float | Schedule
+    n_steps: int
+    batch_size: int
+    n_epochs: int
+    gamma: float
+    gae_lambda: float
+    clip_range: float | Schedule
+    clip_range_vf: float | Schedule | None
+    normalize_advantage: bool
+    ent_coef: Coefficient
+    vf_coef: float
+    max_grad_norm: float | None
+    use_sde: bool
+    sde_sample_freq: int
+    rollout_buffer_class: type[RolloutBuffer] | None
+    rollout_buffer_kwargs: dict[str, Any] | None
+    target_kl: float | None
+    stats_window_size: int
+    tensorboard_log: str | None
+    policy_kwargs: dict[str, Any] | None
+    verbose: int
+    seed: int | None
+    device: th.device | str
+    _init_setup_model: bool
+    desired_kl: Coefficient | None
+    lr_adaptation_kwargs: dict[str, Any] | None
+    advantage_scope: str
+    timeout_bootstrap: str
+
+
+SHARED_CHECKS: dict[str, checks.Check] = {
+    "learning_rate": checks.between(0.0),
+    "clip_range": checks.between(0.0),
+    "clip_range_vf": checks.positive_or_none,
+    "vf_coef": checks.between(0.0),
+    "gamma": checks.between(0.0, 1.0),
+    "gae_lambda": checks.between(0.0, 1.0),
+    "ent_coef": parse_schedule,
+    "target_kl": checks.positive_or_none,
+    "desired_kl": checks.or_none(parse_schedule),
+    "lr_adaptation_kwargs": KLAdaptiveLearningRate.of,
+    "max_grad_norm": checks.or_none(checks.between(-math.inf)),
+    "n_steps": checks.at_least(1),
+    "n_epochs": checks.at_least(1),
+    "advantage_scope": checks.one_of(("minibatch", "rollout")),
+    "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
+}
+"""Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
+
+FORMER_NAMES = {
+    "lr_adaptation": "lr_adaptation_kwargs.interval",
+    "lr_factor": "lr_adaptation_kwargs.factor",
+    "lr_bounds": "lr_adaptation_kwargs.bounds",
+    "kl_margin": "lr_adaptation_kwargs.margin",
+    "kl_window": "lr_adaptation_kwargs.window",
+}
+"""Present names of the shared options by former ones."""
+
+
+def shares_options(
+    base: type[Any],
+    policy_class: type[Any],
+    former_names: Mapping[str, str],
+    **defaults: Any,
+) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Complete a constructor that takes ``*args`` and ``**options`` besides its own options.
+
+    The constructor then has the signature that IDEs, Sphinx and ``inspect`` show: the arguments of
+    ``base`` in their order, the constructor's own, and the options of the policy. It can be called
+    with positional arguments, and with former names of options, which warn.
+
+    :param base: The class that has the shared options.
+    :param policy_class: The class whose own options the algorithm hands on.
+    :param former_names: See :func:`with_present_names`.
+    :param defaults: Defaults of shared options that differ from those of ``base``.
+    """
+
+    def complete(init: Callable[P, None]) -> Callable[P, None]:
+        signature = _complete_signature(init, base, policy_class, defaults)
+
+        @functools.wraps(init)
+        def completed(*args: Any, **options: Any) -> None:
+            options = with_present_names(options, former_names)
+            given = signature.bind(*args, **options).arguments
+            cast("Callable[..., None]", init)(**{**defaults, **given})
+
+        completed.__signature__ = signature  # type: ignore[attr-defined]  # inspect looks here
+        return cast("Callable[P, None]", completed)
+
+    return complete
+
+
+def _complete_signature(
+    init: Callable[..., None],
+    base: type[Any],
+    policy_class: type[Any],
+    defaults: Mapping[str, Any],
+) -> inspect.Signature:
+    shared = _named(inspect.signature(base.__init__))
+    own = _named(inspect.signature(init))
+    for name, default in defaults.items():
+        shared[name] = shared[name].replace(default=default)
+    merged = {**shared, **own, **{option.name: option for option in own_options(policy_class)}}
+    parameters = sorted(merged.values(), key=lambda parameter: parameter.kind)
+    return inspect.Signature(parameters, return_annotation=None)
+
+
+def _named(signature: inspect.Signature) -> dict[str, inspect.Parameter]:
+    """The parameters that have names, without ``*args`` and ``**options``."""
+    collecting = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    return {name: p for name, p in signature.parameters.items() if p.kind not in collecting}
+
+
+def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
+    """The keyword-only parameters of a policy's constructors, its own options."""
+    options: dict[str, inspect.Parameter] = {}
+    for cls in policy_class.__mro__:
+        if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
+            parameters = inspect.signature(vars(cls)["__init__"]).parameters
+            options |= {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
+    return list(options.values())
+
+
+def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Let a constructor take options under their former names too, with a warning.
+
+    :param former_names: Present names by former ones.
+    """
+
+    def extend(init: Callable[P, None]) -> Callable[P, None]:
+        @functools.wraps(init)
+        def extended(*args: P.args, **options: P.kwargs) -> None:
+            present = with_present_names(options, former_names)
+            cast("Callable[..., None]", init)(*args, **present)
+
+        return extended
+
+    return extend
+
+
+def with_present_names(
+    options: Mapping[str, Any], former_names: Mapping[str, str], warn: bool = True
+) -> dict[str, Any]:
+    """Options under their present names; where one has changed, a ``DeprecationWarning``.
+
+    >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
+    {'size': 2, 'rule_kwargs': {'factor': 3}}
+
+    :param options: Options by name, former or present.
+    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
+        become a key of another one.
+    :param warn: Whether to warn. Options that come from a file are nobody's mistake.
+    """
+    present = {name: value for name, value in options.items() if name not in former_names}
+    for former in former_names.keys() & options.keys():
+        name, _, key = former_names[former].partition(".")
+        present[name] = (
+            {**(present.get(name) or {}), key: options[former]} if key else options[former]
+        )
+        _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
+    for name, former in _former_values(present):
+        present[name] = FORMER_VALUES[name, former]
+        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
+    return present
+
+
+def read_loaded_options(model: Any) -> None:
+    """Read what ``load`` sets as attributes: former names, and options of the policy.
+
+    :param model: An algorithm whose attributes have just been loaded.
+    """
+    attributes = vars(model)
+    present = with_present_names(attributes, model.former_names, warn=False)
+    for former in model.former_names.keys() & attributes.keys():
+        del attributes[former]
+    attributes.update(present)
+    for option in own_options(model.policy_base):
+        if option.name in attributes:
+            model.policy_options[option.name] = attributes.pop(option.name)
+
+
+def check_algorithm(model: Any) -> None:
+    """Refuse what cannot be used, before networks and buffers are made.
+
+    :param model: An algorithm whose attributes have been set.
+    :raises ValueError: With what to use instead.
+    """
+    name, space = type(model).__name__, getattr(model, "observation_space", None)
+    checks.check_environment(name, model.env, space)
+    checks.check_flow_spaces(model.action_space, model.use_sde)
+    checks.check_policy_class(name, model.policy_class, model.policy_base)
+    twice = sorted(model.policy_options.keys() & model.policy_kwargs.keys())
+    if twice:
+        raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
+    checks.check_options(model)
+    checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
+    if model.desired_kl is None:
+        return
+    if model.value_of("desired_kl") == 0:
+        raise ValueError(f"desired_kl must be positive or None, got {model.desired_kl}.")
+    learning_rate = FloatSchedule(model.learning_rate)
+    if learning_rate(1.0) != learning_rate(0.0):
+        raise ValueError(
+            "With desired_kl the learning rate follows the divergence of the policy: give the "
+            "learning_rate that it starts with, not a schedule."
+        )
+
+
+def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
+
+
+def _warn_if(warn: bool, change: str) -> None:
+    if warn:
+        warnings.warn(f"{change}: use the new name.", DeprecationWarning, stacklevel=4)

@@ -1,0 +1,69 @@
+"""Nested dictionaries and tuples of tensors, such as a minibatch with its record."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import torch as th
+
+T = TypeVar("T")
+CHUNK = 8192
+"""Rows evaluated at a time: large enough to be fast, small enough for images."""
+
+
+def map_tensors(function: Callable[[th.Tensor], th.Tensor], tree: T) -> T:
+    """Apply a function to every tensor in nested dictionaries and tuples.
+
+    >>> map_tensors(lambda x: x + 1, {"a": th.tensor(1), "b": ()})
+    {'a': tensor(2), 'b': ()}
+    """
+    mapped: Any
+    if isinstance(tree, th.Tensor):
+        mapped = function(tree)
+    elif isinstance(tree, dict):
+        mapped = {key: map_tensors(function, value) for key, value in tree.items()}
+    elif isinstance(tree, tuple):
+        parts = [map_tensors(function, value) for value in tree]
+        mapped = type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    else:
+        raise TypeError(f"Expected tensors in dictionaries or tuples, got {type(tree).__name__}.")
+    result: T = mapped
+    return result
+
+
+def rows(tree: T, chosen: th.Tensor | slice) -> T:
+    """Some of the rows of every tensor in nested dictionaries and tuples."""
+    return map_tensors(lambda values: values[chosen], tree)
+
+
+def tensors(tree: Any) -> Iterator[th.Tensor]:
+    """Every tensor in nested dictionaries and tuples."""
+    if isinstance(tree, th.Tensor):
+        yield tree
+    else:
+        for part in tree.values() if isinstance(tree, dict) else tree:
+            yield from tensors(part)
+
+
+def size_in_bytes(tree: Any) -> int:
+    """Size of all tensors in nested dictionaries and tuples.
+
+    >>> size_in_bytes({"a": th.zeros(3), "b": (th.zeros(2, dtype=th.int64),)})
+    28
+    """
+    return sum(tensor.nbytes for tensor in tensors(tree))
+
+
+def in_chunks(function: Callable[[T], th.Tensor], tree: T) -> th.Tensor:
+    """Apply a function to the rows of nested tensors, some at a time, without gradients.
+
+    >>> in_chunks(lambda pair: pair[0] + pair[1], (th.ones(3), th.arange(3)))
+    tensor([1., 2., 3.])
+
+    :param function: Maps k rows of ``tree`` to a tensor (k, ...).
+    :param tree: Tensors (n, ...) in dictionaries and tuples.
+    :return: The results in order, shape (n, ...).
+    """
+    n_rows = len(next(tensors(tree)))
+    with th.no_grad():
+        starts = range(0, n_rows, CHUNK)
+        return th.cat([function(rows(tree, slice(start, start + CHUNK))) for start in starts])

@@ -1,0 +1,114 @@
+"""The part of an update in which the flow algorithms differ, for one rollout."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch as th
+
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.losses import SURROGATES
+
+
+class PolicyTerms(NamedTuple):
+    """What an algorithm contributes to the loss of a minibatch of n samples.
+
+    ``log_ratio`` has shape (n, ...), with one entry for each surrogate; ``kl`` has no dimensions
+    and measures the change of the policy in nats; ``regularizer`` is added to the loss; the means
+    of ``metrics`` over the minibatches are logged under ``train/``.
+    """
+
+    log_ratio: th.Tensor
+    kl: th.Tensor
+    regularizer: th.Tensor
+    metrics: dict[str, th.Tensor]
+
+
+class FlowUpdate(ABC):
+    """An algorithm's part of the update of one rollout.
+
+    It is made before the first gradient step, so that it can remember the policy that collected
+    the rollout: the reference policy.
+    """
+
+    trust_region: str = "ppo"
+    """Name of the surrogate objective."""
+    clip_range: float | th.Tensor
+    """epsilon, one number or of a shape that broadcasts with a log ratio (n, ...)."""
+    log_ratio_clamp: float | None = None
+    """Log ratios beyond it have no gradient; None for no bound."""
+    surrogate_weights: th.Tensor | None = None
+    """Weights of the surrogates of a sample, of the trailing shape of a log ratio; None for 1."""
+    trains_actor: bool = True
+    """Whether the actor learns from this rollout, or only the critic."""
+
+    @abstractmethod
+    def draw(self, rollout: FlowRolloutBufferSamples) -> Any:
+        """What an epoch draws anew for each sample: a NamedTuple of tensors (n, ...).
+
+        :param rollout: The whole rollout of n samples.
+        """
+
+    @abstractmethod
+    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
+        """The terms of the policy loss.
+
+        :param batch: A minibatch of n samples, with what was drawn for them.
+        :param features: The actor's features, shape (n, features_dim).
+        """
+
+    def surrogate_loss(
+        self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
+    ) -> th.Tensor:
+        """The negative surrogate objective, which keeps the policy near the reference policy.
+
+        :param log_ratio: log rho, shape (n, ...), with one entry for each surrogate.
+        :param advantages: A, shape (n,).
+        :param metrics: Takes what is to be logged of the ratios.
+        :return: The mean over samples and surrogates, a tensor without dimensions.
+        """
+        metrics.add_maxima({"log_ratio_max": log_ratio.detach().abs().max()})
+        if self.log_ratio_clamp is not None:
+            log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
+        advantages = advantages.reshape(-1, *[1] * (log_ratio.dim() - 1))
+        objective = SURROGATES[self.trust_region](log_ratio, advantages, self.clip_range)
+        if self.surrogate_weights is not None:
+            objective = self.surrogate_weights * objective
+        ratio = log_ratio.detach().exp()
+        is_clipped = (ratio - 1).abs() > self.clip_range
+        metrics.add_means({"clip_fraction": is_clipped.float().mean(), "ratio_mean": ratio.mean()})
+        return -objective.mean()
+
+
+class UpdateMetrics:
+    """Collects tensors for each minibatch and brings them to the host in one transfer.
+
+    >>> metrics = UpdateMetrics()
+    >>> metrics.add_means({"loss": th.tensor(1.0)})
+    >>> metrics.add_means({"loss": th.tensor(3.0)})
+    >>> metrics.add_maxima({"log_ratio_max": th.tensor(0.5)})
+    >>> metrics.summary()
+    {'loss': 2.0, 'log_ratio_max': 0.5}
+    """
+
+    def __init__(self) -> None:
+        self._to_average: dict[str, list[th.Tensor]] = {}
+        self._to_maximize: dict[str, list[th.Tensor]] = {}
+
+    def add_means(self, metrics: Mapping[str, th.Tensor]) -> None:
+        """Add metrics of one minibatch, tensors without dimensions, that are averaged."""
+        for name, value in metrics.items():
+            self._to_average.setdefault(name, []).append(value.detach())
+
+    def add_maxima(self, metrics: Mapping[str, th.Tensor]) -> None:
+        """Add metrics of one minibatch of which the greatest counts."""
+        for name, value in metrics.items():
+            self._to_maximize.setdefault(name, []).append(value.detach())
+
+    def summary(self) -> dict[str, float]:
+        """Each metric over all minibatches."""
+        reduced = {name: th.stack(values).mean() for name, values in self._to_average.items()}
+        reduced |= {name: th.stack(values).max() for name, values in self._to_maximize.items()}
+        if not reduced:
+            return {}
+        return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))

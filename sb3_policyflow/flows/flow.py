@@ -1,0 +1,57 @@
+"""The flow of a policy: a velocity field, an interpolant and a solver as one object."""
+
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_policyflow.flows.interpolants import Interpolant
+from sb3_policyflow.flows.solvers import SOLVERS, solver_times
+from sb3_policyflow.flows.velocity import VelocityField
+
+
+class Flow(NamedTuple):
+    """A continuous normalizing flow (paper, flow ODE).
+
+    phi = z + int_0^T v(x_t, t, s) dt,    x_0 = z
+
+    >>> from sb3_policyflow.flows import Rectified
+    >>> flow = Flow(VelocityField(2, 3), Rectified(), solver="midpoint", n_steps=4)
+    >>> flow.solve(th.zeros(5, 2), th.zeros(5, 3)).shape, flow.n_evaluations
+    (torch.Size([5, 2]), 8)
+
+    :param velocity: The field v.
+    :param interpolant: The points between latents and end points at which an update compares
+        velocities; its ``end_time`` T is where the flow ends.
+    :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
+    :param n_steps: Solver steps from latent to end point.
+    """
+
+    velocity: VelocityField
+    interpolant: Interpolant
+    solver: str
+    n_steps: int
+
+    def solve(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """End points of the flow.
+
+        :param latents: z, shape (n, dim).
+        :param features: s, shape (n, features_dim).
+        :return: phi, shape (n, dim).
+        """
+        return self.velocity.integrate(
+            latents,
+            features,
+            solver=self.solver,
+            n_steps=self.n_steps,
+            end_time=self.interpolant.end_time,
+        )
+
+    def times(self) -> th.Tensor:
+        """The solver's time grid on the device of the field (paper: the discrete time grid)."""
+        times = solver_times(self.solver, self.n_steps, self.interpolant.end_time)
+        return times.to(self.velocity.output.weight)
+
+    @property
+    def n_evaluations(self) -> int:
+        """Evaluations of the velocity for one end point."""
+        return self.n_steps * SOLVERS[self.solver].n_stages

@@ -1,0 +1,236 @@
+"""What kernels take: arrays and places in memory, by name, and the functions that take them.
+
+Addresses are those of contiguous float32 arrays, which somebody must keep alive; nothing checks
+their shapes, so they are made from a module's current tensors for each call, see
+:mod:`sb3_policyflow.kernels.inspection`. Numba compiles a kernel for these tuples as it does for
+arrays. Nothing here imports it.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int64]
+Bits = NDArray[np.int32]
+
+
+class KernelInput(NamedTuple):
+    """The first layer of a network, of h outputs: points @ W^T + table[entries] + shifts.
+
+    ``points`` (n, n_points); W are the first n_points of the ``stride`` columns of the layer's
+    weight; ``table`` (n_entries, h); ``entries`` (n,), where an empty array stands for zeros; and
+    ``shifts`` (m, h), each of which serves n / m neighboring rows; m may be 0.
+    """
+
+    points: Floats
+    stride: int
+    table: Floats
+    entries: Integers
+    shifts: Floats
+
+
+class MLPLayout(NamedTuple):
+    """Where an MLP is in memory.
+
+    Addresses of the ``weights`` (n_out, n_in) and ``biases`` (n_out,) of all layers; ``widths``,
+    the outputs of each layer but the last; the activation, see
+    :class:`~sb3_policyflow.kernels.activations.Activation`.
+    """
+
+    weights: Integers
+    biases: Integers
+    widths: Integers
+    kind: int
+    alpha: float
+
+
+class SavedLayers(NamedTuple):
+    """What an MLP's backward pass needs: its activations and their derivatives, n * sum(widths).
+
+    They are flat, in the order in which blocks of rows are computed. Empty arrays if there will be
+    no backward pass.
+    """
+
+    values: Floats
+    derivatives: Floats
+
+
+class MLPGradients(NamedTuple):
+    """Gradients that an MLP's backward pass adds to.
+
+    ``parameters``: those of W^T (n_points, h), of the table, and of weight and bias of each layer
+    behind the first, flat, one behind the other; ``shifts`` (m, h). ``points`` (n, n_points) is
+    filled, or empty if it is not wanted.
+    """
+
+    parameters: Floats
+    shifts: Floats
+    points: Floats
+
+
+class FieldLayout(NamedTuple):
+    """Where the embeddings and the first layer of a velocity field are in memory.
+
+    The ``dim`` of the points, which are the first inputs of the first layer; the activation of the
+    time embedding; and addresses of the ``frequencies``, and of the weights and biases of the time
+    embedding's hidden and output layer, of the observation embedding, and of the ``first`` layer.
+    """
+
+    dim: int
+    kind: int
+    alpha: float
+    n_frequencies: int
+    frequencies: int
+    time_hidden_weight: int
+    time_hidden_bias: int
+    time_output_weight: int
+    time_output_bias: int
+    observation_weight: int
+    observation_bias: int
+    first_weight: int
+    first_bias: int
+
+
+class TimeLayers(NamedTuple):
+    """The time embedding's hidden layer, its derivatives, and the embeddings plus b_o.
+
+    Each has the shape (n_times, embedding_dim).
+    """
+
+    hidden: Floats
+    derivatives: Floats
+    embeddings: Floats
+
+
+class FirstLayerGradients(NamedTuple):
+    """Gradients of the three summands of a first layer of h outputs.
+
+    ``points`` W^T (dim, h), ``table`` (n_times, h), ``shifts`` (m, h).
+    """
+
+    points: Floats
+    table: Floats
+    shifts: Floats
+
+
+class FieldGradients(NamedTuple):
+    """Gradients of the parameters in :class:`FieldLayout`, of their shapes.
+
+    And of the ``features`` (m, n_features), or empty if they are not wanted.
+    """
+
+    features: Floats
+    time_hidden_weight: Floats
+    time_hidden_bias: Floats
+    time_output_weight: Floats
+    time_output_bias: Floats
+    observation_weight: Floats
+    observation_bias: Floats
+    first_weight: Floats
+    first_bias: Floats
+
+
+class FoldedNetwork(NamedTuple):
+    """A velocity field whose first layer is split, see :mod:`sb3_policyflow.flows.folding`.
+
+    Weights of the first layer for ``points`` (dim, widths[0]) and ``features`` (n_features,
+    widths[0]); the ``hidden`` layers behind the first, weights (n_in, n_out) and biases, flat; the
+    layers' ``widths``; weight (dim, widths[-1]) and ``bias`` of the ``output``; the activation.
+    """
+
+    points: Floats
+    features: Floats
+    hidden: Floats
+    widths: Integers
+    output: Floats
+    bias: Floats
+    kind: int
+    alpha: np.float32
+
+
+class Method(NamedTuple):
+    """A fixed-step solver on a grid of times.
+
+    Stage i of a step is k_i = v(x + sum_j a_ij k_j), and a step ends at x + sum_i b_i k_i, where a
+    and b contain the step size; a multistep method adds m (k_0 - k_0 of the step before).
+
+    ``table`` (n_times, widths[0]) is what each time adds to the first layer; ``time_indices``
+    (n_steps, n_stages) are its rows for each stage; ``tableau`` has the rows a_i, b and m.
+    """
+
+    table: Floats
+    time_indices: Integers
+    tableau: Floats
+
+
+class Kernels(Protocol):
+    """The functions of :mod:`sb3_policyflow.kernels._numba`, where they are documented."""
+
+    def forward(
+        self,
+        first: KernelInput,
+        network: MLPLayout,
+        outputs: Floats,
+        saved: SavedLayers,
+        start: int,
+        stop: int,
+    ) -> None:
+        """Evaluate an MLP on some rows."""
+
+    def backward(
+        self,
+        first: KernelInput,
+        network: MLPLayout,
+        saved: SavedLayers,
+        grad_outputs: Floats,
+        gradients: MLPGradients,
+        start: int,
+        stop: int,
+    ) -> None:
+        """Add an MLP's gradients of some rows."""
+
+    def embed(
+        self,
+        times: Floats,
+        entries: Integers,
+        features: Floats,
+        field: FieldLayout,
+        saved: TimeLayers,
+        table: Floats,
+        shifts: Floats,
+    ) -> int:
+        """Evaluate what times and features contribute to a field's first layer."""
+
+    def embed_backward(
+        self,
+        times: Floats,
+        features: Floats,
+        field: FieldLayout,
+        saved: TimeLayers,
+        first: FirstLayerGradients,
+        gradients: FieldGradients,
+    ) -> None:
+        """Gradients of what :meth:`embed` takes."""
+
+    def flow(
+        self,
+        network: FoldedNetwork,
+        method: Method,
+        features: Floats,
+        latents: Floats,
+        endpoints: Floats,
+        start: int,
+        stop: int,
+    ) -> None:
+        """Carry some rows of latents to their end points."""
+
+    def update_copy(self, addresses: Integers, sizes: Integers, copy: Bits) -> bool:
+        """Copy arrays, and say whether the copy was out of date."""
+
+    def clip(self, addresses: Integers, sizes: Integers, max_norm: float) -> float:
+        """Clip arrays to a norm of all together, and return the norm that they had."""
+
+
+Array = NDArray[Any]

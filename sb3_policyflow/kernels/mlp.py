@@ -1,0 +1,263 @@
+"""MLPs evaluated and differentiated by kernels."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_policyflow.kernels.activations import Activation
+from sb3_policyflow.kernels.compiler import note_fallback
+from sb3_policyflow.kernels.inspection import (
+    Layer,
+    ModuleInspector,
+    UnsupportedError,
+    addresses,
+    are_usable,
+)
+from sb3_policyflow.kernels.layouts import (
+    Floats,
+    Integers,
+    KernelInput,
+    Kernels,
+    MLPGradients,
+    MLPLayout,
+    SavedLayers,
+)
+from sb3_policyflow.kernels.threads import in_parts, n_parts
+
+NO_INDEX: Integers = np.zeros(0, dtype=np.int64)
+
+
+class MLP:
+    """Linear layers, at least two, with one activation between them.
+
+    :param kernels: The kernels.
+    :param modules: The layers and activations.
+    :param layers: The layers' parameters.
+    :param activation: The activation.
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        modules: list[nn.Module],
+        layers: list[Layer],
+        activation: Activation,
+    ) -> None:
+        self.kernels = kernels
+        self.modules = modules
+        self.layers = layers
+        self.activation = activation
+        self.tensors = [tensor for layer in layers for tensor in layer]
+        self.shapes = [tensor.shape for tensor in self.tensors]
+        self.n_inputs = layers[0].weight.shape[1]
+        widths = [len(layer.bias) for layer in layers]
+        self.n_outputs = widths.pop()
+        self.n_hidden = sum(widths)
+        self.widths: Integers = np.array(widths)
+        self.flops_per_row = sum(layer.weight.numel() for layer in layers)
+
+    def layout(self, parameters: Sequence[th.Tensor]) -> MLPLayout:
+        """Where the MLP is in memory.
+
+        :param parameters: Weight and bias of each layer.
+        """
+        places = addresses(parameters)
+        return MLPLayout(places[::2], places[1::2], self.widths, *self.activation)
+
+
+def read_mlp(kernels: Kernels, inspector: ModuleInspector, modules: Iterable[nn.Module]) -> MLP:
+    """Read linear layers and the activations between them.
+
+    >>> modules = [nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1)]
+    >>> read_mlp(None, ModuleInspector(), modules).widths
+    array([3])
+
+    :raises UnsupportedError: If the modules are anything else.
+    """
+    modules = list(modules)
+    if len(modules) < 3:
+        raise UnsupportedError("a network has no hidden layers")
+    layers = [inspector.layer(module) for module in modules[::2]]
+    activations = {inspector.activation(module) for module in modules[1::2]}
+    if len(activations) > 1 or len(modules) % 2 == 0:
+        raise UnsupportedError("a network is not linear layers with one activation between them")
+    return MLP(kernels, modules, layers, activations.pop())
+
+
+class Gradients(NamedTuple):
+    """Gradients of an MLP: of W^T and table, see :class:`KernelInput`, shifts, and other layers."""
+
+    points: th.Tensor
+    table: th.Tensor
+    shifts: Floats
+    others: list[th.Tensor]
+
+
+class Evaluation:
+    """An evaluation of an MLP, forward and backward.
+
+    It holds on to neither outputs nor what is saved for the backward pass: they belong to autograd,
+    which knows when they are no longer needed.
+
+    :param network: The MLP, of which the first layer's bias is not used.
+    :param first: Its first layer.
+    """
+
+    def __init__(self, network: MLP, first: KernelInput) -> None:
+        self._network, self._first = network, first
+        self._n_parts = n_parts(len(first.points), network.flops_per_row)
+
+    def forward(self, saves: bool) -> tuple[th.Tensor, th.Tensor]:
+        """Evaluate.
+
+        :param saves: Whether there may be a backward pass.
+        :return: The outputs, shape (n, n_outputs), and what the backward pass needs.
+        """
+        network, first, n_rows = self._network, self._first, len(self._first.points)
+        outputs = th.empty(n_rows, network.n_outputs)
+        # NumPy asks for huge pages. PyTorch does not, and FPO's updates spent a third of their time
+        # waiting for small ones.
+        n_saved = n_rows * network.n_hidden if saves else 0
+        saved = th.from_numpy(np.empty((2, n_saved), dtype=np.float32))
+        arguments = network.layout(network.tensors), outputs.numpy(), SavedLayers(*saved.numpy())
+        run = network.kernels.forward
+        self._in_parts(lambda _, start, stop: run(first, *arguments, start, stop))
+        return outputs, saved
+
+    def backward(
+        self,
+        saved: th.Tensor,
+        parameters: Sequence[th.Tensor],
+        grad_outputs: th.Tensor,
+        grad_points: Floats,
+    ) -> Gradients:
+        """Differentiate.
+
+        :param saved: What :meth:`forward` saved.
+        :param parameters: Those of the MLP again.
+        :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
+        :param grad_points: Filled; shape (n, n_points), or empty if it is not wanted.
+        """
+        network, first = self._network, self._first
+        n_points, (n_entries, width) = first.points.shape[1], first.table.shape
+        sizes = [n_points * width, n_entries * width, *(p.numel() for p in parameters[2:])]
+        # Each thread adds up its own; rows that share a shift belong to one thread.
+        flat = th.zeros(self._n_parts, sum(sizes))
+        shifts, of_thread = np.zeros_like(first.shifts), flat.numpy()
+        layout, layers = network.layout(parameters), SavedLayers(*saved.numpy())
+        outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
+
+        def run_part(part: int, start: int, stop: int) -> None:
+            gradients = MLPGradients(of_thread[part], shifts, grad_points)
+            run(first, layout, layers, outputs, gradients, start, stop)
+
+        self._in_parts(run_part)
+        total = flat[0] if self._n_parts == 1 else flat.sum(0)
+        points, table, *others = th.split(total, sizes)
+        return Gradients(
+            points.view(n_points, width),
+            table.view(n_entries, width),
+            shifts,
+            [part.view(p.shape) for part, p in zip(others, parameters[2:], strict=True)],
+        )
+
+    def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
+        """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both passes.
+
+        What is saved depends on where blocks of rows begin, and rows that share a shift belong
+        together.
+        """
+        n_rows, n_shifts = len(self._first.points), len(self._first.shifts)
+        group = n_rows // n_shifts if n_shifts else 1
+        in_parts(
+            n_rows // group,
+            self._n_parts,
+            lambda part, start, stop: run(part, start * group, stop * group),
+        )
+
+
+class _MLPEvaluation(th.autograd.Function):
+    """An MLP as a node of autograd's graph."""
+
+    @staticmethod
+    def forward(ctx: Any, network: MLP, inputs: th.Tensor, *parameters: th.Tensor) -> th.Tensor:
+        ctx.network, ctx.evaluation = network, _evaluation(network, inputs)
+        outputs: th.Tensor
+        outputs, saved = ctx.evaluation.forward(saves=True)
+        ctx.save_for_backward(saved, inputs, *parameters)
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
+        saved, inputs, *parameters = ctx.saved_tensors
+        if th.is_grad_enabled():
+            module = nn.Sequential(*ctx.network.modules)
+            return None, *differentiable_gradients(module, [inputs], parameters, grad_outputs)
+        grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
+        gradients = ctx.evaluation.backward(saved, parameters, grad_outputs, grad_inputs.numpy())
+        return (
+            None,
+            grad_inputs if ctx.needs_input_grad[1] else None,
+            gradients.points.T.contiguous(),
+            gradients.table[0],
+            *gradients.others,
+        )
+
+
+def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
+    bias = network.layers[0].bias.detach().numpy()
+    no_shifts = np.zeros((0, bias.size), dtype=np.float32)
+    points = inputs.detach().numpy()
+    return Evaluation(
+        network, KernelInput(points, inputs.shape[1], bias[None], NO_INDEX, no_shifts)
+    )
+
+
+def differentiable_gradients(
+    module: nn.Module,
+    inputs: Sequence[th.Tensor],
+    parameters: Sequence[th.Tensor],
+    grad_outputs: th.Tensor,
+) -> list[th.Tensor | None]:
+    """Gradients that have gradients themselves, in plain torch.
+
+    :param module: What was evaluated.
+    :param inputs: What it was called with.
+    :param parameters: Its parameters then, in the order of ``named_parameters``.
+    :param grad_outputs: The gradient of the outputs.
+    :return: A gradient, or None, for each input and each parameter.
+    """
+    names = [name for name, _ in module.named_parameters(remove_duplicate=False)]
+    outputs = th.func.functional_call(
+        module, dict(zip(names, parameters, strict=True)), tuple(inputs)
+    )
+    tensors = [*inputs, *parameters]
+    needed = [tensor for tensor in tensors if tensor.requires_grad]
+    found = iter(th.autograd.grad(outputs, needed, grad_outputs, create_graph=True))
+    return [next(found) if tensor.requires_grad else None for tensor in tensors]
+
+
+def any_needs_grad(tensors: Iterable[th.Tensor]) -> bool:
+    """Whether a gradient with respect to any of the tensors may be asked for."""
+    return any(tensor.requires_grad for tensor in tensors)
+
+
+def evaluate_mlp(network: MLP, inputs: th.Tensor) -> th.Tensor | None:
+    """Evaluate an MLP.
+
+    :param network: The MLP, as it is now.
+    :param inputs: shape (n, n_inputs).
+    :return: The outputs, shape (n, n_outputs), or None where kernels cannot work on the inputs.
+    """
+    if inputs.dim() != 2 or inputs.shape[1] != network.n_inputs:
+        return None
+    if not are_usable((inputs,)):
+        note_fallback("features are not contiguous float32 on the CPU")
+        return None
+    if not (th.is_grad_enabled() and any_needs_grad((inputs, *network.tensors))):
+        return _evaluation(network, inputs).forward(saves=False)[0]
+    apply: Callable[..., th.Tensor] = _MLPEvaluation.apply
+    return apply(network, inputs, *network.tensors)

@@ -1,0 +1,222 @@
+"""An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
+
+import io
+import pathlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_policyflow.resilience.collection import (
+    Infos,
+    RolloutVecEnv,
+    rollback_statistics,
+    terminal_observations,
+)
+from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
+from sb3_policyflow.resilience.finite import check_rollout
+from sb3_policyflow.resilience.saving import RandomStates, ResumeState
+from sb3_policyflow.resilience.workers import watch_workers
+
+SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
+
+
+class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
+    """SB3's ``OnPolicyAlgorithm`` with guarded rollouts, whole files and exact resume.
+
+    - Rollouts are collected through a :class:`RolloutVecEnv`: numbers that are not finite, wrong
+      shapes and dead worker processes stop the training with a sentence, before parameters change.
+    - ``save`` writes a file completely or not at all, with the states of the random generators
+      besides what SB3 saves: parameters, optimizer, counters, progress and last observations.
+    - After ``load``, the next ``learn`` continues as if the run had not been interrupted.
+
+    Nothing here depends on the policy or its update.
+    """
+
+    timeout_bootstrap: str = "terminal"
+    """The value with which an episode cut by a time limit continues: that of the "terminal"
+    observation, as in SB3, of the "current" one before it, or "none"."""
+
+    _collector: RolloutVecEnv | None = None
+    _saved_random_states: RandomStates | None = None
+    """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
+
+    # Collecting rollouts
+
+    @contextmanager
+    def _guarded(self) -> Iterator[VecEnv]:
+        """A block that uses the environment; names its faults and undoes what can be undone."""
+        assert self.env is not None
+        watched = watch_workers(self.env, lambda: self.num_timesteps)
+        with watched, rollback_statistics(self.get_vec_normalize_env()):
+            yield self.env
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self._saved_random_states is not None:
+            self._saved_random_states.restore(self.device)
+            self._saved_random_states = None
+        if self.env is None:
+            raise ValueError(
+                "The model has no environment to learn in: give one to load, as env, or to set_env."
+            )
+        with self._guarded() as env:
+            prepared = super()._setup_learn(*args, **kwargs)
+            RolloutVecEnv(env, self.num_timesteps).check_observations(self._last_obs)
+        return prepared
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Collect one rollout; see SB3.
+
+        :raises FloatingPointError: If environment or policy return a number that is not finite.
+        :raises RuntimeError: If a worker process of the environment has died.
+        """
+        first_timestep = self.num_timesteps
+        try:
+            with self._guarded():
+                self._collector = RolloutVecEnv(env, first_timestep)
+                complete = super().collect_rollouts(
+                    self._collector, callback, rollout_buffer, n_rollout_steps
+                )
+        finally:
+            self._collector = None
+        if complete:
+            check_rollout(rollout_buffer, first_timestep)
+        return complete
+
+    def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
+        # SB3's loop calls this after the callbacks and before it bootstraps.
+        super()._update_info_buffer(infos, dones)
+        if self._collector is not None and dones is not None:
+            self._collector.bootstrap_timeouts(
+                infos, dones, lambda indices: self._timeout_values(infos, indices), self.gamma
+            )
+
+    def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
+        """Values of the states with which episodes continue beyond their time limits."""
+        if self.timeout_bootstrap == "none":
+            return th.zeros(len(indices))
+        observations: Any = self._last_obs
+        if self.timeout_bootstrap == "terminal":
+            observations = terminal_observations(infos, indices)
+            assert self._collector is not None
+            self._collector.check_observations(observations, "terminal observation", indices)
+        elif isinstance(observations, dict):
+            observations = {key: values[indices] for key, values in observations.items()}
+        else:
+            observations = observations[indices]
+        with th.no_grad():
+            return self.policy.predict_values(self.policy.obs_to_tensor(observations)[0])
+
+    # Saving and loading
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save the model, and all that its training depends on, in a zip file; see SB3.
+
+        The file is written completely or not at all: if the process is killed meanwhile, the old
+        file remains.
+
+        :param path: Where to save it, or a file opened for writing.
+        :param exclude: Attributes not to save, such as "resume_state".
+        :param include: Attributes to save that SB3 leaves out.
+        """
+        normalize = self.get_vec_normalize_env()
+        # SB3 saves the attributes that it finds.
+        self.resume_state = ResumeState(
+            random_states=self._saved_random_states or RandomStates.now(self.device),
+            normalized_returns=None if normalize is None else normalize.returns.copy(),
+        )
+        try:
+            if isinstance(path, (str, pathlib.Path)):
+                with atomic_write(path, suffix="zip") as file:
+                    super().save(file, exclude, include)  # type: ignore[arg-type]  # as open_path
+            else:
+                super().save(path, exclude, include)
+        finally:
+            del self.resume_state
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_collector", "_saved_random_states"]
+
+    @classmethod
+    def load(
+        cls: type[SelfResilient],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        reseed: bool = False,
+        **kwargs: Any,
+    ) -> SelfResilient:
+        """Load a model; see SB3.
+
+        The next ``learn`` restores the random generators of torch, numpy and Python as they were
+        when the model was saved, so that training continues as it would have. Environments are
+        seeded with the model's seed and reset, as in SB3, unless ``force_reset`` is False.
+
+        :param path: The file, or one opened for reading.
+        :param env: The environment in which to continue.
+        :param device: Where to put the model.
+        :param custom_objects: Attributes to take instead of the saved ones.
+        :param print_system_info: Whether to print on what system the model was saved.
+        :param force_reset: Whether training starts with new episodes. False continues from the last
+            observations, which is right only if ``env`` is in the state in which it was.
+        :param reseed: Whether to leave the random generators as the model's seed, if it has one,
+            sets them, as SB3 does. So does a ``seed`` among ``kwargs``.
+        :param kwargs: Attributes to change.
+        :raises ValueError: If the file is no saved model, or the environment does not fit it.
+        """
+        with opened(path, suffix="zip") as file:
+            check_archive(file, path, members=("data", "policy.pth"))
+            model = super().load(
+                file, env, device, custom_objects, print_system_info, force_reset, **kwargs
+            )
+        # Files of SB3's own algorithms have none.
+        state: ResumeState | None = model.__dict__.pop("resume_state", None)
+        if not force_reset:
+            model._continue_episodes(state)
+        if state is not None and not reseed and "seed" not in kwargs:
+            model._saved_random_states = state.random_states
+        return model
+
+    def _continue_episodes(self, state: ResumeState | None) -> None:
+        """Check an environment that is not reset against the last observations."""
+        if self.env is None or self._last_episode_starts is None:
+            return
+        n_saved = len(self._last_episode_starts)
+        if n_saved != self.n_envs:
+            raise ValueError(
+                f"The model was saved with {n_saved} environments and cannot continue in the "
+                f"middle of their episodes with {self.n_envs}: leave out force_reset=False."
+            )
+        normalize = self.get_vec_normalize_env()
+        if normalize is not None and state is not None and state.normalized_returns is not None:
+            normalize.returns = state.normalized_returns.copy()
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Timesteps to the end of the ``learn`` that the model was saved in.
+
+        ``model.learn(model.remaining_timesteps, reset_num_timesteps=False)`` completes it.
+        """
+        return max(self._total_timesteps - self.num_timesteps, 0)
