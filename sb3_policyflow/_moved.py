@@ -14,6 +14,19 @@ from importlib.machinery import ModuleSpec
 from types import CodeType, ModuleType
 
 MOVED = {
+    "benchmark.cell": "benchmark.train_one",
+    "benchmark.costs": "benchmark.measure.costs",
+    "benchmark.environments": "benchmark.speed.environments",
+    "benchmark.evaluation": "benchmark.measure.evaluation",
+    "benchmark.goals": "benchmark.measure.goals",
+    "benchmark.panels": "benchmark.variants",
+    "benchmark.plot": "benchmark.figures.plot",
+    "benchmark.plots": "benchmark.figures.goals",
+    "benchmark.speed_settings": "benchmark.speed.settings",
+    "benchmark.statistics": "benchmark.report.statistics",
+    "benchmark.table": "benchmark.report.table",
+    "benchmark.timing": "benchmark.speed.timing",
+    "benchmark.visits": "benchmark.measure.visits",
     "common.aliases": "common.policies",
     "common.arguments": "common.algorithm",
     "common.callbacks": "resilience.checkpoints",

@@ -1,6 +1,6 @@
 """The algorithms of this package, by the names that commands and files have for them."""
 
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.dppo import DPPO
 from sb3_policyflow.fpo import FPO
 from sb3_policyflow.policyflow import PolicyFlow

@@ -10,7 +10,7 @@ from sb3_policyflow._moved import MOVED
 
 OF_PACKAGES = {
     "envs.isaaclab.presets": "integrations.isaaclab.presets",
-    "fused.sampler": "kernels.sampler",
+    "fused.compiler": "kernels.compiler",
     "zoo.samplers": "integrations.rl_zoo3.samplers",
 }
 """Some modules of packages that have moved."""

@@ -1,5 +1,4 @@
 import pytest
-
 from sb3_policyflow.common.learning_rate import KLAdaptiveLearningRate
 
 RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))

@@ -2,7 +2,6 @@
 
 import pytest
 import torch as th
-
 from sb3_policyflow.common.metrics import UpdateMetrics
 
 
