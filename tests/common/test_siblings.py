@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, IdentityEnvBox, SimpleMultiObsEnv
@@ -16,6 +15,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch.nn.utils import parameters_to_vector
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from tests.helpers import SMALL, TINY, TWO_EPOCHS, train, weights
 
 FPO_PLUS_PLUS: dict[str, Any] = {

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 import torch as th
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
 from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.flows import integrate
 from sb3_policyflow.kernels.compiler import note_fallback
 from sb3_policyflow.kernels.fields import KernelVelocityField

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
-from sb3_policyflow.resilience.saving import RandomStates, random_states_kept
+from sb3_policyflow.resilience.saving import RandomStates, preserve_rng_state
 from tests.helpers import SMALL, TINY, train, weights
 
 needs_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="no GPU that torch can use")
@@ -44,7 +44,7 @@ def generator(monkeypatch: pytest.MonkeyPatch) -> Generator:
 
 def test_the_state_of_the_models_device_is_kept(generator: Generator) -> None:
     generator.drawn["cuda:1"] = 5
-    with random_states_kept(CUDA):
+    with preserve_rng_state(CUDA):
         generator.drawn.update({"cuda:0": 3, "cuda:1": 9})
     assert generator.drawn == {"cuda:0": 3, "cuda:1": 5}
 
@@ -87,7 +87,7 @@ class DrawsFirst(BaseCallback):
 
     def _on_training_start(self) -> None:
         device = self.model.device
-        with random_states_kept(device):
+        with preserve_rng_state(device):
             self.drawn = th.randn(4, device=device)
 
     def _on_step(self) -> bool:

@@ -20,8 +20,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.resilience.files import written_whole
-from sb3_policyflow.resilience.saving import RandomStates, random_states_kept
+from sb3_policyflow.resilience.files import atomic_write
+from sb3_policyflow.resilience.saving import RandomStates, preserve_rng_state
 from tests.helpers import SMALL, last_observations, train, weights
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -176,10 +176,10 @@ def test_no_tensor_is_pickled_with_the_attributes(tmp_path: Path) -> None:
     assert not [name for name, value in data.items() if isinstance(value, th.Tensor)]
 
 
-def test_random_states_kept() -> None:
+def test_preserve_rng_state() -> None:
     device = th.device("cpu")
     before = RandomStates.now(device)
-    with random_states_kept(device):
+    with preserve_rng_state(device):
         inside = draws()
     assert draws() == inside
     before.restore(device)
@@ -229,7 +229,7 @@ def test_links_go_on_pointing_at_the_file(tmp_path: Path) -> None:
 
 def test_permissions_are_the_usual_ones(tmp_path: Path) -> None:
     (tmp_path / "usual").touch()
-    with written_whole(tmp_path / "file") as file:
+    with atomic_write(tmp_path / "file") as file:
         file.write(b"x")
     assert (tmp_path / "file").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
