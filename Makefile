@@ -7,7 +7,8 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	--constraint .ci/constraints.txt
 
-PLAYGROUND_TESTS := tests/envs/test_playground.py tests/integrations/rl_zoo3/test_playground_commands.py \
+PLAYGROUND_TESTS := tests/envs/test_playground.py tests/envs/test_playground_tasks.py \
+	tests/integrations/rl_zoo3/test_playground_commands.py \
 	tests/integrations/rl_zoo3/test_experiment.py
 
 .PHONY: demo test test-fast test-playground lint types docs clean

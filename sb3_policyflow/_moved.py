@@ -14,6 +14,19 @@ from importlib.machinery import ModuleSpec
 from types import CodeType, ModuleType
 
 MOVED = {
+    "benchmark.cell": "benchmark.train_one",
+    "benchmark.costs": "benchmark.measure.costs",
+    "benchmark.environments": "benchmark.speed.environments",
+    "benchmark.evaluation": "benchmark.measure.evaluation",
+    "benchmark.goals": "benchmark.measure.goals",
+    "benchmark.panels": "benchmark.variants",
+    "benchmark.plot": "benchmark.figures.plot",
+    "benchmark.plots": "benchmark.figures.goals",
+    "benchmark.speed_settings": "benchmark.speed.settings",
+    "benchmark.statistics": "benchmark.report.statistics",
+    "benchmark.table": "benchmark.report.table",
+    "benchmark.timing": "benchmark.speed.timing",
+    "benchmark.visits": "benchmark.measure.visits",
     "common.aliases": "common.policies",
     "common.arguments": "common.algorithm",
     "common.callbacks": "resilience.checkpoints",
@@ -31,11 +44,14 @@ MOVED = {
     "common.workers": "resilience.workers",
     "diagnostics": "callbacks",
     "envs.isaaclab": "integrations.isaaclab",
+    "envs.playground_names": "envs.task_names",
+    "envs.playground_tasks": "envs.playground.tasks",
     "envs.point_masses": "envs.multigoal.point_masses",
     "flows.paths": "flows.interpolants",
     "fused": "kernels",
     "startup": "integrations.rl_zoo3.startup",
     "zoo": "integrations.rl_zoo3",
+    "zoo.vector": "integrations.rl_zoo3.vec_env",
 }
 """New names by old ones, within this package; those of packages hold for the modules in them."""
 
@@ -107,4 +123,6 @@ def new_name_of(fullname: str) -> str | None:
 def install() -> None:
     """Let old names be imported, once."""
     if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
-        sys.meta_path.append(MovedModules())
+        # Before the other finders: in a package that has moved they would find a module by its
+        # file, and load it a second time under its old name.
+        sys.meta_path.insert(0, MovedModules())

@@ -1,4 +1,4 @@
-"""How good the update's approximations are, measured on a sample of each rollout."""
+"""A callback that measures how good the approximations of PolicyFlow's update are."""
 
 from copy import deepcopy
 from typing import NamedTuple
@@ -20,11 +20,12 @@ from sb3_policyflow.resilience.saving import preserve_rng_state
 
 
 class Shifts(NamedTuple):
-    """How far the end points of n latents have moved, each of shape (n, action_dim).
+    """Shifts of the end points of n latents by an update, each of shape (n, action_dim).
 
-    ``exact`` integrates the flow anew. ``approximate`` is the paper's: the change of the velocity
-    on the path between latent and old end point, averaged over the solver's times. ``sampled`` is
-    the same at the times that the algorithm draws, as its loss sees it.
+    ``exact`` integrates the flow with both policies. ``approximate`` is the paper's approximation:
+    the change of the velocity at points between latent and old end point, averaged over the
+    solver's times. ``sampled`` is the same average over the times that the algorithm draws, which
+    is what its loss uses.
     """
 
     exact: th.Tensor
@@ -33,31 +34,32 @@ class Shifts(NamedTuple):
 
 
 class FlowDiagnosticsCallback(BaseCallback):
-    """Compares the paper's importance ratio with the true one, on some samples of the rollout.
+    """Compares the paper's importance ratio with the exact one, on a sample of the rollout.
 
-    The flow is integrated with the parameters before and after the update. Given its latent, an
-    action has the exact log ratio log N(a; phi', sigma'^2) - log N(a; phi, sigma^2), which the
-    paper approximates by taking phi' - phi from the change of the velocity. Logged with the next
-    rollout, or at the end of the training, under ``diagnostics/``:
+    The flow is integrated with the parameters before and after the update. Given the latent, the
+    exact log ratio of an action is log N(a; phi', sigma'^2) - log N(a; phi, sigma^2). The paper
+    approximates phi' - phi by the change of the velocity. These metrics are logged under
+    ``diagnostics/`` with the next rollout, or at the end of the training:
 
-    - ``log_ratio_correlation``, ``log_ratio_error``: between the approximate and the exact log
-      ratio, Pearson's coefficient and the root mean squared difference; and the same with
-      ``_sampled`` at the end, for the times that the algorithm draws.
-    - ``log_ratio_exact_std``: the size of the exact log ratio, to compare the error with.
-    - ``shift_exact``, ``shift_approximate``: mean lengths of the end point's shift; ``shift_error``
-      the mean length of their difference; ``shift_cosine`` the cosine between them.
-    - ``kl_exact``: the divergence of the policies given the latent, in nats, from the exact shift.
-    - ``action_entropy``: entropy of the actions in nats, from nearest neighbors, averaged over
-      states.
+    - ``log_ratio_correlation`` and ``log_ratio_error``: Pearson's correlation and the root mean
+      squared difference of the approximate and the exact log ratio. With ``_sampled`` at the end of
+      the name, the same for the times that the algorithm draws.
+    - ``log_ratio_exact_std``: standard deviation of the exact log ratio, as a scale for the error.
+    - ``shift_exact`` and ``shift_approximate``: mean length of the end point's shift;
+      ``shift_error``: mean length of their difference; ``shift_cosine``: cosine between them.
+    - ``kl_exact``: KL divergence of the policies given the latent, in nats, from the exact shift.
+    - ``action_entropy``: entropy of the actions in nats, estimated from nearest neighbors and
+      averaged over states.
 
-    Training itself is the same with the callback and without it. For algorithms other than
-    PolicyFlow, only the entropy is logged.
+    The callback does not change the training. For algorithms other than PolicyFlow only the entropy
+    is logged.
 
-    :param every: Rollouts from one measurement to the next.
-    :param n_samples: Transitions of the rollout that are looked at. The cost is two integrations of
-        so many flows.
-    :param n_entropy_states: States in which the entropy of actions is estimated; 0 for none.
-    :param n_entropy_actions: Actions drawn in each of them, at least 2.
+    :param every: Number of rollouts from one measurement to the next.
+    :param n_samples: Number of transitions of the rollout to measure. The cost is that of
+        integrating as many flows twice.
+    :param n_entropy_states: Number of states in which the entropy of actions is estimated; 0 for
+        none.
+    :param n_entropy_actions: Number of actions drawn in each of these states, at least 2.
     :param verbose: See SB3.
     :raises ValueError: If a number is too small.
     """
@@ -94,7 +96,7 @@ class FlowDiagnosticsCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        """Keep the policy and some of the rollout, before the update changes the policy."""
+        """Copy the policy and a sample of the rollout, before the update changes the policy."""
         self.n_rollouts += 1
         if self.n_rollouts % self.every == 0:
             with preserve_rng_state(self.model.device), th.no_grad():
@@ -117,7 +119,7 @@ class FlowDiagnosticsCallback(BaseCallback):
             self.logger.dump(self.num_timesteps)
 
     def _measure(self) -> None:
-        """Compare the policy with what it was before the update."""
+        """Compare the policy with the copy from before the update."""
         assert self._before is not None
         (old, samples), self._before = self._before, None
         new = self.algorithm.policy
@@ -154,14 +156,14 @@ class FlowDiagnosticsCallback(BaseCallback):
         }
 
     def _draw_times(self, samples: FlowRolloutBufferSamples) -> th.Tensor:
-        """Times as the algorithm draws them, shape (n, n_times)."""
+        """Draw times as the algorithm does, shape (n, n_times)."""
         model = self.algorithm
         assert isinstance(model, PolicyFlow)
         times = TIME_SAMPLERS[model.time_sampler](model.policy.flow.times())
         return times.sample(len(samples.actions), model.n_times)
 
     def _entropy(self, policy: BaseFlowPolicy, observations: PyTorchObs) -> th.Tensor:
-        """Entropy of the actions in nats, mean over states."""
+        """Entropy of the actions in nats, averaged over states."""
         some = rows(observations, slice(self.n_entropy_states))
         return action_entropy(policy, policy.actor_features(some), self.n_entropy_actions)
 
@@ -172,12 +174,13 @@ def end_point_shifts(
     samples: FlowRolloutBufferSamples,
     times: th.Tensor,
 ) -> Shifts:
-    """How far the ends of the flow have moved between two policies.
+    """Shifts of the flow's end points from one policy to another.
 
-    :param old: The policy that made the samples.
+    :param old: The policy that collected the samples.
     :param new: The policy after an update.
-    :param samples: n transitions with the record of PolicyFlow.
+    :param samples: n transitions with PolicyFlow's record of latents and end points.
     :param times: Times for ``Shifts.sampled``, shape (n, k).
+    :return: The exact, approximate and sampled shifts.
     """
     latents = samples.record.latents
     features = {policy: policy.actor_features(samples.observations) for policy in (old, new)}
@@ -201,5 +204,5 @@ def _rms(values: th.Tensor) -> th.Tensor:
 
 
 def _correlation(one: th.Tensor, other: th.Tensor) -> th.Tensor:
-    """Pearson's coefficient of two tensors (n,); not a number if one is constant."""
+    """Pearson's correlation of two tensors (n,); NaN if one of them is constant."""
     return th.corrcoef(th.stack([one, other]))[0, 1]

@@ -1,4 +1,4 @@
-"""Policies as files that run without this package: ONNX, or torch alone.
+"""Export of policies to files that run without this package: ONNX, or torch alone.
 
 .. code-block:: bash
 
@@ -19,23 +19,21 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.dppo import DPPO
-from sb3_policyflow.fpo import FPO
-from sb3_policyflow.policyflow import PolicyFlow
 
 Observations = th.Tensor | dict[str, th.Tensor]
-ALGORITHMS: tuple[type[FlowOnPolicyAlgorithm], ...] = (PolicyFlow, FPO, DPPO)
 
 
 class NormalizeObservation(nn.Module):
-    """What ``VecNormalize`` does to an observation, with its statistics as they are now.
+    """The normalization of observations by ``VecNormalize``, with its present statistics.
 
-    clip((o - mean) / sqrt(var + epsilon), -clip_obs, clip_obs)    in double precision, as there
+    clip((o - mean) / sqrt(var + epsilon), -clip_obs, clip_obs)
 
-    :param normalize: The wrapper.
-    :param key: Which of the observations, if they are a dictionary.
+    Computed in double precision, as ``VecNormalize`` does.
+
+    :param normalize: The wrapper, whose statistics are copied.
+    :param key: Key of the observation, if the observations are a dictionary.
     """
 
     mean: th.Tensor
@@ -49,19 +47,24 @@ class NormalizeObservation(nn.Module):
         self.clip = float(normalize.clip_obs)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """Normalized observations in single precision, of the same shape."""
+        """Normalize observations.
+
+        :param observations: Observations of any shape (n, ...) and dtype.
+        :return: Normalized observations in single precision, of the same shape.
+        """
         normalized = (observations.double() - self.mean) / self.std
         return normalized.clamp(-self.clip, self.clip).float()
 
 
 class ActionModule(nn.Module):
-    """The way from observations to actions, as ``predict(deterministic=True)`` goes it from z = 0.
+    """Maps observations to actions, as ``predict(deterministic=True)`` does.
 
-    Normalization, preprocessing, the steps of the flow or of the denoising chain one after another,
-    and the bounds of the actions: tensors in, tensors out, nothing drawn at random.
+    Applies normalization, preprocessing, all steps of the flow or of the denoising chain, and the
+    bounds of the actions. Inputs and outputs are tensors, and nothing is drawn at random.
 
-    :param policy: The policy, of which a copy is taken.
-    :param normalize: The environment's ``VecNormalize``, if it has one.
+    :param policy: The policy, which is copied.
+    :param normalize: The ``VecNormalize`` that the policy was trained with. Without it the module
+        takes observations that are normalized already.
     """
 
     low: th.Tensor
@@ -78,12 +81,12 @@ class ActionModule(nn.Module):
         self.register_buffer("high", th.as_tensor(box.high, dtype=th.float32))
 
     def forward(self, observations: Observations, latents: th.Tensor | None = None) -> th.Tensor:
-        """Act.
+        """Compute actions.
 
-        :param observations: As the environment gives them, images with their channels first: a
-            tensor (n, ...), or a dictionary of them.
-        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given. A
-            PolicyFlow's are of standard deviation ``latent_std``.
+        :param observations: Observations of the environment, with images channels first: a tensor
+            (n, ...), or a dictionary of tensors.
+        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
+            PolicyFlow's latents have standard deviation ``latent_std``.
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
@@ -103,9 +106,9 @@ class ActionModule(nn.Module):
         return self.normalizers["all"](observations) if self.normalizers else observations
 
     def example(self, latents: bool = False) -> tuple[Any, ...]:
-        """Arguments of :meth:`forward` for a batch of two.
+        """Arguments of :meth:`forward` for a batch of two, filled with zeros.
 
-        :param latents: Whether to include some.
+        :param latents: Whether to include latents.
         """
         space = self.policy.observation_space
         if isinstance(space, spaces.Dict):
@@ -117,7 +120,7 @@ class ActionModule(nn.Module):
         return observations, th.zeros(2, self.policy.action_dim)
 
     def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
-        """What the environment gives: normalized observations have been floats before."""
+        """Zeros of the dtype that the input has: float32 if it is normalized in the graph."""
         assert space.shape is not None
         dtype = np.float32 if key in self.normalizers else space.dtype
         return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype))
@@ -142,16 +145,16 @@ def export(
 ) -> None:
     """Write a policy to a file that runs without this package.
 
-    ``.onnx`` is a graph for onnxruntime and others, with one input for each observation, named as
-    in a Dict space or else "observation", and perhaps "latents"; its output is "actions". ``.pt2``
-    is a program for ``torch.export.load``. Any number of observations can be given at once.
+    An ``.onnx`` file is a graph for onnxruntime and similar programs. Its inputs are "observation",
+    or the keys of a Dict space, and with ``latents`` also "latents"; its output is "actions". A
+    ``.pt2`` file is a program for ``torch.export.load``. The batch may have any size.
 
     :param policy: The policy, ``model.policy``.
     :param path: The file, which ends in ".onnx" or ".pt2".
-    :param normalize: The environment's ``VecNormalize``, if it has one: then the file takes
-        observations that are not normalized yet.
-    :param latents: Whether latents z, shape (n, action_dim), are an input; they are 0 otherwise.
-    :raises ValueError: If the file is to be of another kind.
+    :param normalize: The ``VecNormalize`` that the policy was trained with. If it is missing, the
+        file takes observations that are normalized already, and returns wrong actions for others.
+    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise z = 0.
+    :raises ValueError: If ``path`` has another suffix.
     """
     path = Path(path)
     if path.suffix not in (".onnx", ".pt2"):
@@ -167,7 +170,7 @@ def export(
 
 
 def _any_batch(example: tuple[Any, ...]) -> tuple[Any, ...]:
-    """That the first axis of every input may have any size."""
+    """Dynamic shapes in which the first axis of every input may have any size."""
     batch = {0: th.export.Dim.DYNAMIC}
     return tuple(
         dict.fromkeys(part, batch) if isinstance(part, dict) else batch for part in example
@@ -189,14 +192,15 @@ def _write_onnx(program: th.export.ExportedProgram, example: tuple[Any, ...], pa
 
 
 def load_policy(path: str | Path) -> FlowPolicy:
-    """The policy of a saved model, whichever algorithm trained it.
+    """Load the policy of a saved model, whichever algorithm of this package trained it.
 
     :param path: The model's zip file.
+    :return: The policy, on the CPU.
     :raises ValueError: If no algorithm of this package trained it.
     """
     data, _, _ = load_from_zip_file(path, device="cpu")
     policy_class = (data or {}).get("policy_class", object)
-    for algorithm in ALGORITHMS:
+    for algorithm in ALGORITHMS.values():
         if issubclass(policy_class, algorithm.policy_base):
             return algorithm.load(path, device="cpu").policy
     raise ValueError(
@@ -208,7 +212,7 @@ def load_policy(path: str | Path) -> FlowPolicy:
 def main(arguments: list[str] | None = None) -> None:
     """Export a policy from the command line.
 
-    :param arguments: The command line's arguments; those of the process if not given.
+    :param arguments: Arguments of the command line; those of the process if not given.
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_policyflow.export", description=__doc__)
     parser.add_argument("model", help="the model's zip file")

@@ -87,11 +87,12 @@ def test_the_last_update_is_logged_too(tmp_path: Path) -> None:
     assert log["diagnostics/kl_exact"].notna().tolist() == [False, True, True]
 
 
-@pytest.mark.parametrize("path", ["rectified", "trigflow"])
-def test_shifts_of_constant_fields(path: str) -> None:
+@pytest.mark.parametrize("interpolant", ["rectified", "trigflow"])
+def test_shifts_of_constant_fields(interpolant: str) -> None:
     """A field that is constant in space and time moves all ends by its change times the length."""
     old, new = (
-        PolicyFlow("MlpPolicy", environment(), path=path, **SMALL).learn(256) for _ in range(2)
+        PolicyFlow("MlpPolicy", environment(), interpolant=interpolant, **SMALL).learn(256)
+        for _ in range(2)
     )
     for model, constant in ((old, 1.0), (new, 3.0)):
         with th.no_grad():
@@ -100,7 +101,7 @@ def test_shifts_of_constant_fields(path: str) -> None:
     samples = old.rollout_buffer.samples()
     with th.no_grad():
         shifts = end_point_shifts(old.policy, new.policy, samples, th.rand(256, 3))
-    expected = np.full((256, 2), 2.0 * {"rectified": 1.0, "trigflow": math.pi / 2}[path])
+    expected = np.full((256, 2), 2.0 * {"rectified": 1.0, "trigflow": math.pi / 2}[interpolant])
     for shift in shifts:
         np.testing.assert_allclose(shift, expected, rtol=1e-5)
 

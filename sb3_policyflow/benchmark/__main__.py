@@ -1,41 +1,61 @@
-"""``python -m sb3_policyflow.benchmark SUBCOMMAND ...``: each is a module with ``main(argv)``."""
+"""``python -m sb3_policyflow.benchmark COMMAND ...``."""
 
 import argparse
 import importlib
 import sys
 
-from sb3_policyflow.benchmark.results import ResultsError
+from sb3_policyflow.benchmark.errors import BenchmarkError
 
-SUBCOMMANDS = {
-    "demo": "train PolicyFlow on MultiGoal and show which goals it reaches",
-    "run": "train and evaluate algorithms, environments and seeds",
-    "table": "sum up what was run",
-    "plot": "draw learning curves and probabilities of improvement",
-    "multigoal": "the paper's MultiGoal figure",
-    "pointmaze": "the paper's exploration maps",
-    "playground": "four algorithms on tasks of MuJoCo Playground",
-    "speed": "time PolicyFlow and PPO side by side",
-    "environments": "time environments on their own",
-    "cell": "one training, as `run` starts it",
+COMMANDS = {
+    "demo": ("demo", "train PolicyFlow on MultiGoal and show which goals it reaches"),
+    "run": ("run", "train and evaluate algorithms, environments and seeds"),
+    "table": ("report.table", "sum up what was run"),
+    "plot": ("figures.plot", "draw learning curves and comparisons of two algorithms"),
+    "multigoal": ("multigoal", "the paper's MultiGoal figure"),
+    "pointmaze": ("pointmaze", "the paper's exploration maps"),
+    "playground": ("playground", "four algorithms on tasks of MuJoCo Playground"),
+    "speed": ("speed.training", "time PolicyFlow and PPO side by side"),
+    "environments": ("speed.environments", "time environments on their own"),
 }
-"""What each does; the module is of the same name."""
+"""Each command's module, which has ``add_arguments(parser)`` and ``main(arguments)``, and its help.
+
+The module's docstring describes the command.
+"""
+
+INTERNAL = {"train-one": "train_one"}
+"""What commands start in processes of their own."""
+
+PROGRAM = "python -m sb3_policyflow.benchmark"
 
 
 def main(argv: list[str]) -> int:
-    """Hand the arguments to a subcommand's module."""
-    lines = "\n".join(f"  {name:12} {text}" for name, text in SUBCOMMANDS.items())
+    """Run a command.
+
+    :param argv: The command and its arguments.
+    :return: The exit code.
+    """
+    lines = "\n".join(f"  {name:12} {text}" for name, (_, text) in COMMANDS.items())
     parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark",
-        description=f"subcommands:\n{lines}",
+        prog=PROGRAM,
+        description=f"commands:\n{lines}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("subcommand", choices=SUBCOMMANDS, metavar="SUBCOMMAND")
-    name = parser.parse_args(argv[:1] or ["--help"]).subcommand
-    module = importlib.import_module(f"sb3_policyflow.benchmark.{name}")
+    modules = INTERNAL | {name: module for name, (module, _) in COMMANDS.items()}
+    parser.add_argument("command", metavar="COMMAND")
+    command = parser.parse_args(argv[:1] or ["--help"]).command
+    if command not in modules:
+        parser.error(f"no command {command!r}: choose from {', '.join(COMMANDS)}")
+    module = importlib.import_module(f"sb3_policyflow.benchmark.{modules[command]}")
+    command_parser = argparse.ArgumentParser(
+        prog=f"{PROGRAM} {command}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(command_parser)
     try:
-        code: int = module.main(argv[1:])
-    except ResultsError as error:
-        sys.stderr.write(f"{error}\n")
+        code: int = module.main(command_parser.parse_args(argv[1:]))
+    except BenchmarkError as error:
+        print(error, file=sys.stderr)
         return 2
     return code
 

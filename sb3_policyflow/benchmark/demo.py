@@ -4,7 +4,6 @@ Writes ``trajectories.png``, ``learning_curve.png``, ``progress.csv`` and ``mode
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,13 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_policyflow.benchmark.experiment import make_experiment
-from sb3_policyflow.benchmark.goals import evaluate_goals, goal_report, sample_trajectories
-from sb3_policyflow.benchmark.plots import goals_figure, learning_curve_figure
+from sb3_policyflow.benchmark.figures.goals import goals_figure
+from sb3_policyflow.benchmark.figures.progress import progress_figure
+from sb3_policyflow.benchmark.measure.goals import (
+    evaluate_goals,
+    goal_report,
+    sample_trajectories,
+)
 
 ENV = "MultiGoal-v0"
 N_TRAJECTORIES = 1000
@@ -63,30 +67,27 @@ def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
     return model
 
 
-def main(argv: list[str]) -> int:
-    """Train, sample, draw and report."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark demo", description=__doc__
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
     parser.add_argument("--steps", type=float, help="environment steps; default: the YAML file's")
     parser.add_argument("--out", type=Path, default=Path("demo"), help="default: demo")
-    arguments = parser.parse_args(argv)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Train, sample, draw and report."""
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     steps = None if arguments.steps is None else int(arguments.steps)
-
     model = train(arguments.seed, steps, folder)
     trajectories = sample_trajectories(model, N_TRAJECTORIES)
     goals_figure({"PolicyFlow": trajectories}).savefig(folder / "trajectories.png")
-    learning_curve_figure({"PolicyFlow": folder / "progress.csv"}).savefig(
-        folder / "learning_curve.png"
-    )
+    progress_figure(folder / "progress.csv").savefig(folder / "learning_curve.png")
     assert model.ep_info_buffer is not None
     training_return = np.mean([episode["r"] for episode in model.ep_info_buffer])
-    sys.stdout.write(
+    print(
         f"After {model.num_timesteps:,} steps the training return is {training_return:.2f}.\n"
         f"{N_TRAJECTORIES} stochastic trajectories from the center: {goal_report(trajectories)}.\n"
-        f"Pictures: {folder / 'trajectories.png'} and {folder / 'learning_curve.png'}.\n"
+        f"Pictures: {folder / 'trajectories.png'} and {folder / 'learning_curve.png'}."
     )
     return 0

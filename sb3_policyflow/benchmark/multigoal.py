@@ -4,17 +4,20 @@ Trains what is missing, with every seed; draws the first seed's trajectories to 
 and writes the table of all seeds to ``multigoal.md``.
 """
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sb3_policyflow.benchmark.goals import Trajectories
-from sb3_policyflow.benchmark.panels import Panel, over_seeds, panel_cells, panel_parser
-from sb3_policyflow.benchmark.plots import goals_figure
-from sb3_policyflow.benchmark.results import Cell, Result, distinct, load_results
-from sb3_policyflow.benchmark.run import report_failures, run_cells
-from sb3_policyflow.benchmark.table import markdown_table
+from sb3_policyflow.benchmark.figures.goals import goals_figure
+from sb3_policyflow.benchmark.measure.goals import Trajectories
+from sb3_policyflow.benchmark.report.markdown import markdown_table
+from sb3_policyflow.benchmark.report.statistics import over_seeds
+from sb3_policyflow.benchmark.report.table import seeds_caption
+from sb3_policyflow.benchmark.results import Result, Run, distinct, load_results
+from sb3_policyflow.benchmark.run import run_and_report
+from sb3_policyflow.benchmark.variants import Variant, add_variant_arguments, variant_runs
 
 ENV = "MultiGoal-v0"
 N_TRAJECTORIES = 1000
@@ -30,7 +33,6 @@ HEADER = (
     "minutes",
 )
 
-
 ROLLOUTS = {"n_envs": 1024, "n_steps": 24, "batch_size": 1536, "n_epochs": 5}
 """Alike for all; smaller minibatches than the paper's 6144 do all of them good."""
 
@@ -41,23 +43,23 @@ Advantages that are divided by their deviation would make much of the small diff
 left between goals late in a training.
 """
 
-PANELS = {
-    "a-ppo": Panel("(a) PPO, Gaussian entropy", "ppo", ROLLOUTS | {"ent_coef": 0.001}),
-    "b-dppo": Panel(
+VARIANTS = {
+    "a-ppo": Variant("(a) PPO, Gaussian entropy", "ppo", ROLLOUTS | {"ent_coef": 0.001}),
+    "b-dppo": Variant(
         "(b) DPPO", "dppo", ROLLOUTS | {"min_sampling_std": 0.1, "min_log_prob_std": 0.1}
     ),
-    "c-fpo": Panel("(c) FPO", "fpo", ROLLOUTS | {"learning_rate": "lin_3e-4"}),
-    "d-uniform": Panel(
+    "c-fpo": Variant("(c) FPO", "fpo", ROLLOUTS | {"learning_rate": "lin_3e-4"}),
+    "d-uniform": Variant(
         "(d) PolicyFlow, uniform noise",
         "policyflow",
         PLAIN | {"uniform_noise_coef": 0.05},
     ),
-    "e-gaussian": Panel(
+    "e-gaussian": Variant(
         "(e) PolicyFlow, Gaussian entropy",
         "policyflow",
         PLAIN | {"ent_coef": 0.001},
     ),
-    "f-brownian": Panel(
+    "f-brownian": Variant(
         "(f) PolicyFlow, Brownian regularizer",
         "policyflow",
         PLAIN | {"brownian_coef": 0.2, "ent_coef": 0.001},
@@ -66,55 +68,60 @@ PANELS = {
 """The paper's panels (a) to (f)."""
 
 
-def load_trajectories(cell: Cell, folder: Path) -> Trajectories:
-    """The episodes from the center that a cell kept."""
-    with np.load(cell.path(folder, ".npz")) as kept:
+def load_trajectories(run: Run, folder: Path) -> Trajectories:
+    """The episodes from the center that a run kept."""
+    with np.load(run.path(folder, ".npz")) as kept:
         positions = kept["positions"].astype(np.float64)
         return Trajectories(positions, kept["lengths"].astype(int), kept["returns"])
 
 
 def goals_table(results: Sequence[Result]) -> str:
-    """A row for each panel: means over seeds, and the range where there are several."""
+    """A row for each variant."""
     rows = [
-        _row(name, [result for result in results if result.cell.name == name])
+        _row(name, [result for result in results if result.run.name == name])
         for name in distinct(results, "name")
     ]
-    return markdown_table(HEADER, rows)
+    return f"{markdown_table(HEADER, rows)}\n\n{seeds_caption(results)}\n"
 
 
-def _row(name: str, runs: Sequence[Result]) -> list[str]:
-    goals = [run.summary["goals"] for run in runs]
+def _row(name: str, results: Sequence[Result]) -> list[str]:
+    summaries = [result.summary for result in results]
+    goals = [summary["goals"] for summary in summaries]
     missed = [g["n_missed"] / (g["n_missed"] + sum(g["counts"])) for g in goals]
     return [
-        PANELS[name].title if name in PANELS else name,
-        str(len(runs)),
-        over_seeds([g["mean_return"] for g in goals]),
-        over_seeds([run.summary["final"]["stochastic"]["mean_return"] for run in runs]),
-        over_seeds([g["n_goals"] for g in goals], digits=1),
-        over_seeds([g["entropy"] for g in goals]),
+        VARIANTS[name].title if name in VARIANTS else name,
+        str(len(results)),
+        over_seeds([g["mean_return"] for g in goals]).format(".2f"),
+        over_seeds([s["final"]["stochastic"]["mean_return"] for s in summaries]).format(".2f"),
+        over_seeds([g["n_goals"] for g in goals]).format(".2g"),
+        over_seeds([g["entropy"] for g in goals]).format(".2f"),
         f"{np.mean(missed):.1%}",
-        f"{np.mean([run.summary['gradient_steps'] for run in runs]):,.0f}",
-        f"{np.mean([run.summary['seconds']['training'] for run in runs]) / 60:.1f}",
+        f"{np.mean([summary['gradient_steps'] for summary in summaries]):,.0f}",
+        f"{np.mean([summary['seconds']['training'] for summary in summaries]) / 60:.1f}",
     ]
 
 
 def draw(folder: Path, results: Sequence[Result]) -> None:
-    """Write the figure of each panel's first seed, and the table of all."""
-    first = {result.cell.name: result.cell for result in reversed(results)}
-    runs = {
-        PANELS[name].title: load_trajectories(first[name], folder)
-        for name in PANELS
+    """Write the figure of each variant's first seed, and the table of all."""
+    first = {result.run.name: result.run for result in reversed(results)}
+    trajectories = {
+        VARIANTS[name].title: load_trajectories(first[name], folder)
+        for name in VARIANTS
         if name in first
     }
-    goals_figure(runs).savefig(folder / "multigoal.png")
-    (folder / "multigoal.md").write_text(goals_table(results) + "\n", encoding="utf-8")
+    goals_figure(trajectories).savefig(folder / "multigoal.png")
+    (folder / "multigoal.md").write_text(goals_table(results), encoding="utf-8")
 
 
-def main(argv: list[str]) -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add_variant_arguments(parser, VARIANTS, steps=3e6, out=Path("docs/results/multigoal"))
+
+
+def main(arguments: argparse.Namespace) -> int:
     """Train what is missing and make the figure."""
-    arguments = panel_parser("multigoal", __doc__, PANELS, steps=3e6).parse_args(argv)
-    cells = panel_cells(PANELS, arguments, env=ENV, n_trajectories=N_TRAJECTORIES)
-    failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
-    code = report_failures(failed)
+    runs = variant_runs(VARIANTS, arguments, env=ENV, n_trajectories=N_TRAJECTORIES)
+    code = run_and_report(runs, arguments)
     draw(arguments.out, load_results(arguments.out))
+    print(f"Wrote {arguments.out / 'multigoal.png'} and {arguments.out / 'multigoal.md'}.")
     return code

@@ -4,13 +4,16 @@ Trains what is missing, with every task and seed, and sums up these tasks in ``t
 ``curves.png`` and ``improvement.png``. Needs the extra ``playground``.
 """
 
+import argparse
+from pathlib import Path
 from typing import Any
 
-from sb3_policyflow.benchmark.panels import Panel, panel_cells, panel_parser
-from sb3_policyflow.benchmark.plot import write_figures
+from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.figures.plot import write_figures
+from sb3_policyflow.benchmark.report.table import report
 from sb3_policyflow.benchmark.results import load_results
-from sb3_policyflow.benchmark.run import report_failures, require_env, run_cells
-from sb3_policyflow.benchmark.table import overall_table, summary
+from sb3_policyflow.benchmark.run import run_and_report
+from sb3_policyflow.benchmark.variants import Variant, add_variant_arguments, variant_runs
 from sb3_policyflow.envs import PLAYGROUND
 
 TASKS = ("CartpoleBalance", "ReacherHard", "CheetahRun", "FingerSpin")
@@ -54,27 +57,30 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 and DPPO's noise, chosen on CheetahRun, and FPO's clamp, without which a training became infinite
 (docs/results.md). The second PolicyFlow has narrower latents than the paper's."""
 
-PANELS = {
-    name: Panel(name, name.partition("-")[0], ROLLOUTS | hyperparams)
+VARIANTS = {
+    name: Variant(name, name.partition("-")[0], ROLLOUTS | hyperparams)
     for name, hyperparams in ALGORITHMS.items()
 }
 
 
-def main(argv: list[str]) -> int:
-    """Train what is missing and sum up."""
-    parser = panel_parser("playground", __doc__, PANELS, steps=3e6)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    add_variant_arguments(parser, VARIANTS, steps=3e6, out=Path("docs/results/playground"))
     parser.add_argument("--tasks", nargs="+", default=TASKS, help="default: all four")
     parser.set_defaults(evaluations=5, episodes=10)
-    arguments = parser.parse_args(argv)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Train what is missing and sum up."""
     envs = [f"{PLAYGROUND}{task}-v0" for task in arguments.tasks]
     for env in envs:
         require_env(env)
-    cells = [cell for env in envs for cell in panel_cells(PANELS, arguments, env=env)]
-    failed = run_cells(cells, arguments.out, arguments.jobs, arguments.threads)
-    code = report_failures(failed)
+    runs = [run for env in envs for run in variant_runs(VARIANTS, arguments, env=env)]
+    code = run_and_report(runs, arguments)
     results = load_results(arguments.out, envs)
-    write_figures(results, arguments.out)
+    table = arguments.out / "table.md"
     # Returns of all tasks of the control suite are from 0 to 1000.
-    text = f"{overall_table(results)}\n\n{summary(results)}"
-    (arguments.out / "table.md").write_text(text, encoding="utf-8")
+    table.write_text(report(results, overall=True), encoding="utf-8")
+    written = [*write_figures(results, arguments.out), table]
+    print(f"Wrote {', '.join(map(str, written))}.")
     return code

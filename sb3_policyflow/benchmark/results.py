@@ -1,7 +1,7 @@
-"""The files of a benchmark: what a cell of it is, and what came of it.
+"""The files of a benchmark: what a run of it is, and what came of it.
 
 A folder holds ``NAME/ENV/seed-N.json`` (settings, final evaluations, costs, versions) and
-``seed-N.csv`` (evaluations over time) for each cell: one algorithm, environment and seed.
+``seed-N.csv`` (evaluations over time) for each run: one algorithm, environment and seed.
 """
 
 import csv
@@ -11,15 +11,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.resilience.files import atomic_write
+
+DEFAULT_FOLDER = Path("benchmark-results")
+
 CURVE_FIELDS = ("timesteps", "mode", "mean_return", "std_return", "mean_length", "n_episodes")
 
 
-class ResultsError(ValueError):
-    """The files are not what a command needs; the message says what to do."""
-
-
 @dataclass(frozen=True)
-class Cell:
+class Run:
     """One training.
 
     :param name: What the tables call it: the algorithm's name, or that of a variant.
@@ -45,21 +46,24 @@ class Cell:
     n_trajectories: int = 0
     keep_visits: bool = False
 
+    def __str__(self) -> str:
+        return f"{self.name} {self.env} seed {self.seed}"
+
     def path(self, folder: Path, suffix: str) -> Path:
         """Where a file of it is, for instance with the suffix ".json"."""
         return folder / self.name / self.env.replace("/", "-") / f"seed-{self.seed}{suffix}"
 
     def is_done(self, folder: Path) -> bool:
-        """Whether it has been run.
+        """Whether its results are there.
 
-        :raises ResultsError: If it has been, with other settings.
+        :raises BenchmarkError: If they are, and were made with other settings.
         """
         path = self.path(folder, ".json")
         if not path.is_file():
             return False
-        settings = json.loads(path.read_text(encoding="utf-8"))["cell"]
+        settings, _ = _read_summary(path)
         if settings != asdict(self):
-            raise ResultsError(
+            raise BenchmarkError(
                 f"{path} was made with other settings, {settings}: choose another --out, or "
                 "delete it."
             )
@@ -68,23 +72,37 @@ class Cell:
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a cell: ``summary`` as in its JSON file, ``curve`` the rows of its CSV file."""
+    """What came of a run: ``summary`` as in its JSON file, ``curve`` the rows of its CSV file."""
 
-    cell: Cell
+    run: Run
     summary: dict[str, Any]
     curve: list[dict[str, Any]]
 
     def save(self, folder: Path) -> None:
-        """Write both files; the cell counts as done once the JSON file is there."""
-        self.cell.path(folder, ".json").parent.mkdir(parents=True, exist_ok=True)
-        with open(self.cell.path(folder, ".csv"), "w", newline="", encoding="utf-8") as file:
+        """Write both files; the run counts as done once the JSON file is there."""
+        path = self.run.path(folder, ".json")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path.with_suffix(".csv"), "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, CURVE_FIELDS)
             writer.writeheader()
             writer.writerows(self.curve)
-        text = json.dumps({"cell": asdict(self.cell), **self.summary}, indent=1)
-        partial = self.cell.path(folder, ".json.partial")
-        partial.write_text(text + "\n", encoding="utf-8")
-        partial.replace(self.cell.path(folder, ".json"))
+        text = json.dumps({"run": asdict(self.run), **self.summary}, indent=1)
+        with atomic_write(path) as file:
+            file.write(f"{text}\n".encode())
+
+    @classmethod
+    def load(cls, path: Path) -> "Result":
+        """Read what ``save`` wrote.
+
+        :param path: The JSON file.
+        """
+        settings, summary = _read_summary(path)
+        with open(path.with_suffix(".csv"), newline="", encoding="utf-8") as file:
+            curve: list[dict[str, Any]] = [
+                {key: value if key == "mode" else float(value) for key, value in row.items()}
+                for row in csv.DictReader(file)
+            ]
+        return cls(Run(**settings), summary, curve)
 
     def final_return(self, mode: str) -> float | None:
         """Mean return at the end of the training; None if there is no such mode."""
@@ -97,36 +115,34 @@ class Result:
         return [row["timesteps"] for row in rows], [row["mean_return"] for row in rows]
 
 
+def _read_summary(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The settings of a run, and the rest of its JSON file."""
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    # Version 0.1.0 wrote "cell".
+    settings = summary.pop("run" if "run" in summary else "cell")
+    return settings, summary
+
+
 def load_results(folder: Path, envs: Sequence[str] = ()) -> list[Result]:
     """What has been run, in the order of names, environments and seeds.
 
     :param folder: Where it is.
     :param envs: Environments to take; all if not given.
-    :raises ResultsError: If there is nothing.
+    :raises BenchmarkError: If there is nothing.
     """
-    results = [_load(path) for path in folder.glob("*/*/seed-*.json")]
-    results = [result for result in results if not envs or result.cell.env in envs]
+    results = [Result.load(path) for path in folder.glob("*/*/seed-*.json")]
+    results = [result for result in results if not envs or result.run.env in envs]
     if not results:
         which = f" of {', '.join(envs)}" if envs else ""
-        raise ResultsError(f"No results{which} in {folder}: make some with the subcommand run.")
-    return sorted(results, key=lambda r: (r.cell.name, r.cell.env, r.cell.seed))
-
-
-def _load(path: Path) -> Result:
-    summary = json.loads(path.read_text(encoding="utf-8"))
-    with open(path.with_suffix(".csv"), newline="", encoding="utf-8") as file:
-        curve: list[dict[str, Any]] = [
-            {key: value if key == "mode" else float(value) for key, value in row.items()}
-            for row in csv.DictReader(file)
-        ]
-    return Result(Cell(**summary.pop("cell")), summary, curve)
+        raise BenchmarkError(f"No results{which} in {folder}: make some with the command run.")
+    return sorted(results, key=lambda r: (r.run.name, r.run.env, r.run.seed))
 
 
 def distinct(results: Sequence[Result], what: str) -> list[str]:
     """The names ("name") or environments ("env") in some results, in their order."""
-    return list(dict.fromkeys(getattr(result.cell, what) for result in results))
+    return list(dict.fromkeys(getattr(result.run, what) for result in results))
 
 
 def select(results: Sequence[Result], name: str, env: str) -> list[Result]:
     """The seeds of one name in one environment."""
-    return [r for r in results if (r.cell.name, r.cell.env) == (name, env)]
+    return [r for r in results if (r.run.name, r.run.env) == (name, env)]

@@ -5,58 +5,54 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
-import gymnasium as gym
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
-from sb3_policyflow.benchmark.results import Cell, ResultsError
-from sb3_policyflow.envs import ensure_registered
-
-DEFAULT_FOLDER = Path("benchmark-results")
+from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.results import DEFAULT_FOLDER, Run
 
 
-def run_cells(
-    cells: Iterable[Cell], folder: Path, n_jobs: int = 1, n_threads: int = 1
-) -> list[Cell]:
-    """Run the cells that have not been run, each in a process of its own.
+def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int = 1) -> list[Run]:
+    """Run what has not been run, each training in a process of its own.
 
     What a process says goes to ``NAME/ENV/seed-N.log``, which stays only if it fails.
 
-    :param cells: What is wanted.
+    :param runs: What is wanted.
     :param folder: Where results are and go.
     :param n_jobs: Processes at a time.
     :param n_threads: Threads of each.
-    :return: The cells that failed.
-    :raises ResultsError: If a cell has been run with other settings.
+    :return: The runs that failed.
+    :raises BenchmarkError: If one has been run with other settings.
     """
-    cells = list(cells)
-    missing = [cell for cell in cells if not cell.is_done(folder)]
+    runs = list(runs)
+    missing = [run for run in runs if not run.is_done(folder)]
     failed = []
     with (
-        tqdm(total=len(cells), initial=len(cells) - len(missing), unit="cell") as bar,
+        tqdm(total=len(runs), initial=len(runs) - len(missing), unit="run") as bar,
         ThreadPoolExecutor(n_jobs) as pool,
     ):
-        jobs = {pool.submit(_run_cell, cell, folder, n_threads): cell for cell in missing}
+        jobs = {pool.submit(_succeeds, run, folder, n_threads): run for run in missing}
         for job in as_completed(jobs):
-            cell = jobs[job]
+            run = jobs[job]
             if not job.result():
-                failed.append(cell)
-                bar.write(f"failed: see {cell.path(folder, '.log')}", file=sys.stderr)
-            bar.set_postfix_str(f"{cell.name} {cell.env} seed {cell.seed}")
+                failed.append(run)
+                bar.write(f"failed: see {run.path(folder, '.log')}", file=sys.stderr)
+            bar.set_postfix_str(str(run))
             bar.update()
     return failed
 
 
-def _run_cell(cell: Cell, folder: Path, n_threads: int) -> bool:
-    """Run one cell and wait for it; whether all went well."""
-    log = cell.path(folder, ".log")
+def _succeeds(run: Run, folder: Path, n_threads: int) -> bool:
+    """Train in another process and wait for it; whether all went well."""
+    log = run.path(folder, ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "sb3_policyflow.benchmark", "cell"]
-    command += [json.dumps(asdict(cell)), str(folder), "--threads", str(n_threads)]
+    command = [sys.executable, "-m", "sb3_policyflow.benchmark", "train-one"]
+    command += [json.dumps(asdict(run)), str(folder), "--threads", str(n_threads)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(n_threads))
     with open(log, "w", encoding="utf-8") as file:
         outcome = subprocess.run(
@@ -69,52 +65,55 @@ def _run_cell(cell: Cell, folder: Path, n_threads: int) -> bool:
     return outcome.returncode == 0
 
 
-def report_failures(failed: Sequence[Cell]) -> int:
-    """Say what failed; the exit code of the command."""
-    for cell in failed:
-        sys.stderr.write(f"failed: {cell.name} {cell.env} seed {cell.seed}\n")
+def run_and_report(runs: Iterable[Run], arguments: argparse.Namespace) -> int:
+    """Run what has not been run, and say what came of it.
+
+    :param runs: What is wanted.
+    :param arguments: The options of :func:`add_running_arguments`.
+    :return: The exit code of the command.
+    """
+    runs = list(runs)
+    failed = run_all(runs, arguments.out, arguments.jobs, arguments.threads)
+    for run in failed:
+        print(f"failed: {run}", file=sys.stderr)
+    print(f"{len(runs) - len(failed)} of {len(runs)} results are in {arguments.out}.", flush=True)
     return 1 if failed else 0
 
 
-def require_env(env_id: str) -> None:
-    """See whether there is an environment, before trainings are started in it.
+def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
+    """Add what every command that trains takes.
 
-    :raises ResultsError: If there is none, or what it needs is missing.
+    :param parser: The command's.
+    :param out: Folder of the results, if not given.
     """
-    try:
-        ensure_registered(env_id)
-        gym.spec(env_id)
-    except gym.error.Error as error:
-        raise ResultsError(str(error)) from error
-
-
-def add_running_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every command that trains takes."""
+    parser.add_argument(
+        "--out", type=Path, default=out, help="folder of the results; default: %(default)s"
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="default: 0")
     numbers = {
         "jobs": (1, "processes at a time"),
         "threads": (1, "threads of each"),
         "evaluations": (10, "over the training"),
         "episodes": (20, "of an evaluation"),
     }
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="default: 0")
     for name, (default, text) in numbers.items():
         parser.add_argument(
             f"--{name}", type=int, default=default, help=f"{text}; default: %(default)s"
         )
 
 
-def main(argv: list[str]) -> int:
-    """Run every combination of algorithms, environments and seeds."""
-    # Only this command takes it; the figures' commands, which run cells too, start without rl_zoo3.
-    from rl_zoo3.utils import StoreDict
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    # Only this command takes them; the figures' commands, which train too, start without rl_zoo3.
+    from rl_zoo3.utils import ALGOS, StoreDict
 
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark run", description=__doc__
+    algos = [name for name, algo in ALGOS.items() if issubclass(algo, OnPolicyAlgorithm)]
+    default = ["policyflow", "fpo", "dppo", "ppo"]
+    parser.add_argument(
+        "--algos", nargs="+", choices=algos, default=default, help=f"default: {default}"
     )
-    parser.add_argument("--algos", nargs="+", default=["policyflow", "fpo", "dppo", "ppo"])
     parser.add_argument("--envs", nargs="+", required=True, help="ids of environments")
     parser.add_argument("--steps", type=float, required=True, help="environment steps, say 1e6")
-    parser.add_argument("--out", type=Path, default=DEFAULT_FOLDER, help="folder of the results")
     parser.add_argument(
         "--hyperparams",
         nargs="+",
@@ -123,12 +122,15 @@ def main(argv: list[str]) -> int:
         metavar="NAME:VALUE",
         help="what differs from the YAML files, as rl_zoo3 takes it, for example n_epochs:4",
     )
-    add_running_arguments(parser)
-    arguments = parser.parse_args(argv)
+    add_running_arguments(parser, DEFAULT_FOLDER)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Run every combination of algorithms, environments and seeds."""
     for env in arguments.envs:
         require_env(env)
-    cells = [
-        Cell(
+    runs = [
+        Run(
             algo,
             algo,
             env,
@@ -142,4 +144,4 @@ def main(argv: list[str]) -> int:
         for seed in arguments.seeds
         for algo in arguments.algos
     ]
-    return report_failures(run_cells(cells, arguments.out, arguments.jobs, arguments.threads))
+    return run_and_report(runs, arguments)

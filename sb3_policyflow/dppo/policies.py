@@ -170,9 +170,16 @@ class DPPOPolicy(FlowPolicy):
         :param features: The actor's features, shape (n, features_dim).
         :return: Shape (n, k, action_dim).
         """
-        return self._means(points, slice(self.n_frozen_steps, None), features.unsqueeze(1))
+        return self.step_means(points, slice(self.n_frozen_steps, None), features.unsqueeze(1))
 
-    def _means(self, points: th.Tensor, steps: Steps, features: th.Tensor) -> th.Tensor:
+    def step_means(self, points: th.Tensor, steps: Steps, features: th.Tensor) -> th.Tensor:
+        """Means of one step or of several, of which frozen ones use the base networks.
+
+        :param points: Where the steps start, shape (n, action_dim), or (n, k, action_dim) for k.
+        :param steps: Index of the step, or a slice of trained ones.
+        :param features: The actor's features, of a shape that broadcasts with that of the points.
+        :return: Of the shape of the points.
+        """
         is_frozen = isinstance(steps, int) and steps < self.n_frozen_steps
         network = self.base_velocity if is_frozen else self.velocity
         if self._has_base_features:
@@ -204,7 +211,7 @@ class DPPOPolicy(FlowPolicy):
         points, means = [latents], list[th.Tensor]()
         stds = self.chain.stds.clamp(min=self.min_sampling_std)
         for step in range(self.n_denoising_steps):
-            means.append(self._means(points[-1], step, features))
+            means.append(self.step_means(points[-1], step, features))
             points.append(self._noisy(means[-1], stds[step]) if is_noisy else means[-1])
         return points, means
 

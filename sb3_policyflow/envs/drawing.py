@@ -1,6 +1,8 @@
-"""Anti-aliased lines and discs on an RGB array, and the environments' pictures made of them."""
+"""Anti-aliased lines and discs on an RGB array, and the environments' pictures made of them.
 
-from __future__ import annotations
+NumPy is enough for this, so that the environments need no dependency to draw: pygame, with which
+Gymnasium draws its own, is an optional extra.
+"""
 
 from functools import lru_cache
 from itertools import pairwise
@@ -8,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from sb3_policyflow.envs.type_aliases import FloatArray
+
 Color = tuple[float, float, float]
 
 # Okabe and Ito's palette, told apart by color-blind readers too; one color for each goal.
@@ -27,8 +30,8 @@ MARGIN: Color = (0.88, 0.89, 0.91)
 class Canvas:
     """A square picture of the plane's region ``|x|, |y| <= half_width``, y upwards.
 
-    :param size: width and height in pixels
-    :param half_width: half the width of the region, in the plane's units
+    :param size: Width and height in pixels.
+    :param half_width: Half the width of the region, in the plane's units.
     """
 
     def __init__(self, size: int, half_width: float) -> None:
@@ -42,7 +45,7 @@ class Canvas:
         return np.array([x + self.half_width, self.half_width - y]) * self.scale - 0.5
 
     def centers(self) -> FloatArray:
-        """The plane's points at the pixel centers, shape ``(size, size, 2)``."""
+        """The plane's points at the pixel centers, shape (size, size, 2)."""
         along = (np.arange(len(self.image)) + 0.5) / self.scale - self.half_width
         return np.stack(np.meshgrid(along, -along), axis=-1)
 
@@ -58,11 +61,11 @@ class Canvas:
 
         A pixel is covered by ``clip(width / 2 - distance to the segment + 1/2, 0, 1)``, in pixels.
 
-        :param start: the segment's first point
-        :param end: its last point; the same as ``start`` draws a disc
-        :param width: in the plane's units
-        :param color: red, green and blue in [0, 1]
-        :param opacity: in [0, 1]
+        :param start: The segment's first point.
+        :param end: Its last point; the same as ``start`` draws a disc.
+        :param width: In the plane's units.
+        :param color: Red, green and blue in [0, 1].
+        :param opacity: In [0, 1].
         """
         first, last = self.pixel(start), self.pixel(end)
         reach = width * self.scale / 2 + 0.5
@@ -79,7 +82,7 @@ class Canvas:
         self.line(center, center, 2 * radius, color, opacity)
 
     def to_uint8(self) -> NDArray[np.uint8]:
-        """The picture as bytes, shape ``(size, size, 3)``."""
+        """The picture as bytes, shape (size, size, 3)."""
         return (self.image * 255 + 0.5).astype(np.uint8)
 
 
@@ -96,12 +99,12 @@ def _distance_to_segment(
 def draw_multigoal(
     goals: FloatArray, wall: float, trail: FloatArray, size: int
 ) -> NDArray[np.uint8]:
-    """The workspace, its goals and the path of one episode, shape ``(size, size, 3)``.
+    """The workspace, its goals and the path of one episode, shape (size, size, 3).
 
-    :param goals: shape ``(n_goals, 2)``
-    :param wall: the workspace is ``|x|, |y| <= wall``
-    :param trail: the positions so far, oldest first, shape ``(n, 2)``
-    :param size: width and height in pixels
+    :param goals: Shape (n_goals, 2).
+    :param wall: The workspace is ``|x|, |y| <= wall``.
+    :param trail: The positions so far, oldest first, shape (n, 2).
+    :param size: Width and height in pixels.
     """
     canvas = Canvas(size, half_width=wall * 1.06)
     canvas.image = _workspace(tuple(map(tuple, goals.tolist())), wall, size).copy()
@@ -114,10 +117,10 @@ def draw_maze(
 ) -> NDArray[np.uint8]:
     """A square maze from above, its goals and the path of one episode.
 
-    :param free: whether each cell is free, rows from the top, shape ``(n, n)``
-    :param goals: shape ``(n_goals, 2)``, the maze's cells having side 1 and its center the origin
-    :param trail: the positions so far, oldest first, shape ``(n_positions, 2)``
-    :param size: width and height in pixels
+    :param free: Whether each cell is free, rows from the top, shape (n, n).
+    :param goals: Shape (n_goals, 2), the maze's cells having side 1 and its center the origin.
+    :param trail: The positions so far, oldest first, shape (n_positions, 2).
+    :param size: Width and height in pixels.
     """
     canvas = Canvas(size, half_width=len(free) / 2)
     cell = np.arange(size) * len(free) // size

@@ -1,31 +1,49 @@
-"""Packages that only an extra of this package brings."""
+"""Packages that only an extra of this package brings, and how to install them."""
 
 import importlib
 
 from gymnasium.error import DependencyNotInstalled
 
 
+def install_command(extra: str, upgrade: bool = False) -> str:
+    """The command that installs an extra of this package, for hints in error messages.
+
+    It is for a checkout, because no package index has this package.
+
+    :param extra: Name of the extra.
+    :param upgrade: Whether to upgrade all that the extra brings.
+
+    >>> install_command("robotics")
+    'run `pip install ".[robotics]"` in the checkout of sb3-policyflow'
+    """
+    options = "--upgrade --upgrade-strategy eager " if upgrade else ""
+    return f'run `pip install {options}".[{extra}]"` in the checkout of sb3-policyflow'
+
+
 def import_extra(module: str, extra: str, env_id: str) -> None:
     """Import a module that only an extra of this package brings.
 
-    :raises DependencyNotInstalled: if it is missing, or does not go with what else is installed;
-        with the command that installs it
+    :param module: Name of the module.
+    :param extra: Name of the extra.
+    :param env_id: What needs it, for the error.
+    :raises DependencyNotInstalled: If it is missing, or does not work with what else is installed;
+        with the command that installs it.
     """
-    command = f"pip install 'sb3-policyflow[{extra}]'"
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name != module:
-            raise _broken(module, env_id, command, error) from error
-        raise DependencyNotInstalled(f"{env_id} needs {module}: {command}") from error
-    # What a package does when its dependencies' versions do not suit it is its own choice.
+            raise _broken(module, extra, env_id, error) from error
+        message = f"{env_id} needs {module}: {install_command(extra)}"
+        raise DependencyNotInstalled(message) from error
+    # A package may raise anything if the versions of its dependencies do not suit it.
     except Exception as error:
-        raise _broken(module, env_id, command, error) from error
+        raise _broken(module, extra, env_id, error) from error
 
 
-def _broken(module: str, env_id: str, command: str, error: Exception) -> DependencyNotInstalled:
+def _broken(module: str, extra: str, env_id: str, error: Exception) -> DependencyNotInstalled:
     first_line = next(iter(str(error).splitlines()), "")
     return DependencyNotInstalled(
-        f"{env_id} needs {module}, which does not go with the packages installed here "
-        f"({type(error).__name__}: {first_line}): {command} --upgrade"
+        f"{env_id} needs {module}, which does not work with the packages installed here "
+        f"({type(error).__name__}: {first_line}): {install_command(extra, upgrade=True)}"
     )

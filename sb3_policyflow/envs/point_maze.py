@@ -26,13 +26,12 @@ from numpy.typing import NDArray
 
 from sb3_policyflow.envs.drawing import draw_maze
 from sb3_policyflow.envs.extras import import_extra
+from sb3_policyflow.envs.type_aliases import Float32Array, FloatArray, Info
 
 if TYPE_CHECKING:
     from gymnasium_robotics.envs.maze.point_maze import PointMazeEnv
 
-FloatArray = NDArray[np.float64]
 Cell = tuple[int, int]
-Info = dict[str, Any]
 
 ENV_ID = "PointMazeMultiGoal-Medium-v0"
 START_CELL: Cell = (1, 1)
@@ -60,16 +59,16 @@ def cell_center(cell: Cell, maze: NDArray[np.bool_]) -> FloatArray:
     return np.array([column + 0.5 - n_columns / 2, n_rows / 2 - row - 0.5])
 
 
-class PointMazeMultiGoalEnv(gym.Env[FloatArray, NDArray[np.float32]]):
+class PointMazeMultiGoalEnv(gym.Env[FloatArray, Float32Array]):
     """``PointMazeMultiGoal-Medium-v0``: see the module for the task and its assumptions.
 
     Observation ``[x, y, v_x, v_y]``, action ``[f_x, f_y]`` in ``[-1, 1]``. ``info["is_success"]``
     says whether the ball is within 0.45 of a goal, the stock task's radius. The time limit is that
     of ``gymnasium.make``.
 
-    :param render_mode: ``None`` or ``"rgb_array"``, a view from above with the episode's trail
-    :param start_cell: row and column of the start
-    :param goal_cells: rows and columns of the goals
+    :param render_mode: ``None`` or ``"rgb_array"``, a view from above with the episode's trail.
+    :param start_cell: Row and column of the start.
+    :param goal_cells: Rows and columns of the goals.
     """
 
     metadata: Info = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
@@ -104,7 +103,7 @@ class PointMazeMultiGoalEnv(gym.Env[FloatArray, NDArray[np.float32]]):
         self._trail = [self.start]
         return observation, self._info(observation)
 
-    def step(self, action: NDArray[np.float32]) -> tuple[FloatArray, float, bool, bool, Info]:
+    def step(self, action: Float32Array) -> tuple[FloatArray, float, bool, bool, Info]:
         observation: FloatArray = self.simulation.step(action)[0]["observation"]
         if self.render_mode is not None:
             self._trail.append(observation[:2].copy())

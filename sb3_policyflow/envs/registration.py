@@ -5,21 +5,16 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_policyflow.envs.extras import import_extra
-from sb3_policyflow.envs.playground.tasks import require_task
-from sb3_policyflow.envs.task_names import (
-    OTHER_PLAYGROUND_TASKS,
-    PLAYGROUND,
-    PLAYGROUND_TASKS,
-)
+from sb3_policyflow.envs.task_names import OTHER_PLAYGROUND_TASKS, PLAYGROUND, PLAYGROUND_TASKS
 
 _ROBOTICS = ("Adroit", "AntMaze", "Fetch", "Franka", "Hand", "PointMaze")
-"""Beginnings of gymnasium-robotics' environment ids."""
+"""What the ids of gymnasium-robotics' environments begin with."""
 
 
 def register() -> None:
     """Register this package's environments with Gymnasium; calling it again changes nothing.
 
-    Entry points are strings, so nothing is imported before an environment is made.
+    Entry points are strings: a simulator is imported when one of its environments is made.
     """
     _register(
         "MultiGoal-v0",
@@ -39,18 +34,21 @@ def register() -> None:
 def ensure_registered(env_id: str) -> None:
     """Register an environment that this package knows of, if it is not registered yet.
 
-    Call it before ``gymnasium.make`` where an id comes from a user: it imports gymnasium-robotics
-    for its ids, and registers a task that has been added to MuJoCo Playground as
-    ``Playground/NAME-v0``. Other ids are left to ``gymnasium.make``, whose error names the nearest
+    Call it before ``gymnasium.make`` if an id comes from a user. It imports gymnasium-robotics for
+    the ids of that package, and registers tasks that have been added to MuJoCo Playground as
+    ``Playground/NAME-v0``. Other ids are left to ``gymnasium.make``, whose error suggests similar
     ones.
 
-    :param env_id: for instance ``PointMaze_Medium_Diverse_GDense-v3``, ``Playground/MyTask-v0``
-    :raises DependencyNotInstalled: if the package that has it is missing or does not work
-    :raises NameNotFound: if MuJoCo Playground has no such task
+    :param env_id: For instance ``PointMaze_Medium_Diverse_GDense-v3``, ``Playground/MyTask-v0``.
+    :raises DependencyNotInstalled: If the package that has it is missing or does not work.
+    :raises NameNotFound: If MuJoCo Playground has no such task.
     """
     if env_id in gym.registry:
         return
     if env_id.startswith(PLAYGROUND):
+        # What needs the extra "playground" is imported on demand.
+        from sb3_policyflow.envs.playground.tasks import require_task
+
         task = env_id.removeprefix(PLAYGROUND).removesuffix("-v0")
         require_task(task)
         _register_playground(task)

@@ -1,4 +1,4 @@
-"""Names of MuJoCo Playground's tasks, which are known before it is imported."""
+"""Names of MuJoCo Playground's tasks, so that they can be registered without importing it."""
 
 PLAYGROUND = "Playground/"
 """What the ids of the tasks begin with."""
@@ -63,5 +63,7 @@ OTHER_PLAYGROUND_TASKS = (
     "PandaPickCubeOrientation",
     "PandaRobotiqPushCube",
 )
-"""The other tasks of MuJoCo Playground 0.2: control, locomotion, manipulation. What later versions
-and users add to these is registered on demand."""
+"""The other tasks of MuJoCo Playground 0.2: control, locomotion, manipulation.
+
+Tasks that later versions or users add are registered by ``ensure_registered``.
+"""

@@ -1,8 +1,6 @@
 """Gymnasium vector environments as Stable-Baselines3 vectorized environments."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -17,26 +15,53 @@ from stable_baselines3.common.vec_env.base_vec_env import (
     VecEnvStepReturn,
 )
 
-Info = dict[str, Any]
+from sb3_policyflow.envs.type_aliases import Info
 
 
+def row(observations: Any, index: int) -> Any:
+    """One environment's part of a batch of observations.
+
+    :param observations: An array (num_envs, ...), or a dictionary of such arrays.
+    :param index: Which environment.
+    """
+    if isinstance(observations, dict):
+        return {key: row(values, index) for key, values in observations.items()}
+    return observations[index]
+
+
+def final_infos(observations: Any, done: NDArray[np.bool_]) -> Info:
+    """What a vector environment with same-step autoreset says of the episodes that have ended.
+
+    :param observations: Those before the reset, an array (num_envs, ...) or a dictionary of them.
+    :param done: Where an episode has ended, shape (num_envs,).
+    :return: ``final_obs`` and its mask, as Gymnasium has them.
+    """
+    final_obs = np.full(len(done), None, dtype=object)
+    for i in np.flatnonzero(done).tolist():
+        final_obs[i] = row(observations, i)
+    return {"final_obs": final_obs, "_final_obs": done}
+
+
+# Gymnasium's DictInfoToList does the same, but not quite. It leaves NumPy scalars, takes arrays
+# only, drops every key that begins with "_", and visits every environment for each key: with 1024
+# environments, of which 28 had ended an episode, it took 161 microseconds, this function 93.
 def unbatch_infos(infos: Info, num_envs: int) -> list[Info]:
-    """One dictionary per environment out of Gymnasium's dictionary of arrays.
+    """One dictionary for each environment, from Gymnasium's dictionary of arrays.
 
-    Environment ``i`` gets ``key`` if the mask ``_key`` holds there, or if there is no mask.
-    A nested dictionary is treated the same way; numbers become Python numbers.
+    Environment i gets ``key`` where the mask ``_key`` is true, or if there is no mask. Nested
+    dictionaries are treated in the same way; numbers become Python numbers.
 
     >>> unbatch_infos({"x": np.array([1, 0]), "_x": np.array([True, False])}, 2)
     [{'x': 1}, {}]
     """
-    rows: list[Info] = [{} for _ in range(num_envs)]
+    unbatched: list[Info] = [{} for _ in range(num_envs)]
     for key, values in infos.items():
         if key.startswith("_") and key[1:] in infos:
             continue
         items = _unbatch(values, num_envs)
         for i in np.flatnonzero(infos.get(f"_{key}", np.ones(num_envs, dtype=bool))).tolist():
-            rows[i][key] = items[i]
-    return rows
+            unbatched[i][key] = items[i]
+    return unbatched
 
 
 def _unbatch(values: Any, num_envs: int) -> Sequence[Any]:
@@ -53,20 +78,27 @@ class GymVectorVecEnv(VecEnv):
     episode's first, ``terminal_observation`` the last of the one that ended, and
     ``TimeLimit.truncated`` is true if it was truncated and not terminated.
 
-    ``seed(n)`` hands ``n`` to the next ``reset`` of the vector environment, which derives one
-    stream per environment from it, or draws for all of them from a single stream, as it sees fit.
+    ``seed(n)`` hands n to the next ``reset`` of the vector environment, which decides whether each
+    environment has a random stream of its own or all share one.
 
     If the vector environment holds sub-environments in ``envs`` (as ``SyncVectorEnv`` does),
     ``get_attr``, ``set_attr``, ``env_method`` and ``env_is_wrapped`` reach each of them. Otherwise
     they act on the batch: the value is the same for every environment, and only all can be set.
 
-    :param env: the vector environment
-    :raises ValueError: if ``env`` does not reset in the step in which an episode ends
+    :param env: The vector environment.
+    :param batch_options: What makes one dictionary of reset options from one for each environment;
+        if not given, ``set_options`` takes one dictionary for all.
+    :raises ValueError: If ``env`` does not reset in the step in which an episode ends.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        batch_options: Callable[[Sequence[Info]], Info] | None = None,
+    ) -> None:
         _require_same_step(env)
         self.env = env
+        self._batch_options = batch_options
         self.spec = env.spec  # VecMonitor names the environment in its file
         self._actions: NDArray[Any] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -87,15 +119,15 @@ class GymVectorVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         dones = terminated | truncated
-        rows = unbatch_infos(infos, self.num_envs)
+        unbatched = unbatch_infos(infos, self.num_envs)
         for i in np.flatnonzero(dones).tolist():
-            rows[i] = self._end_episode(i, rows[i])
-        for row, timed_out in zip(rows, (truncated & ~terminated).tolist(), strict=True):
-            row["TimeLimit.truncated"] = timed_out
-        return observations, rewards.astype(np.float32), dones, rows
+            unbatched[i] = self._end_episode(i, unbatched[i])
+        for info, timed_out in zip(unbatched, (truncated & ~terminated).tolist(), strict=True):
+            info["TimeLimit.truncated"] = timed_out
+        return observations, rewards.astype(np.float32), dones, unbatched
 
     def _end_episode(self, index: int, info: Info) -> Info:
-        """The ended episode's last info; what else the vector environment said is of the next."""
+        """The last info of the episode that has ended; the rest is of the next episode."""
         terminal_observation = info.pop("final_obs")
         last_info = info.pop("final_info", {})
         self.reset_infos[index] = info
@@ -166,15 +198,12 @@ class GymVectorVecEnv(VecEnv):
             return first or None
         if not any(self._options):
             return None
+        if self._batch_options is None:
+            raise ValueError(
+                f"{self.env} takes one dictionary of reset options for all its environments: "
+                "call set_options with a dict, not a list."
+            )
         return self._batch_options(self._options)
-
-    def _batch_options(self, options: Sequence[Info]) -> Info:
-        """One dictionary that stands for different options per environment."""
-        del options
-        raise ValueError(
-            f"{self.env} takes one dictionary of reset options for all its environments: "
-            "call set_options with a dict, not a list."
-        )
 
 
 def _require_same_step(env: VectorEnv[Any, Any, Any]) -> None:

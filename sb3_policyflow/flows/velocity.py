@@ -24,7 +24,7 @@ class FourierTimeEmbedding(nn.Module):
 
     :param embedding_dim: Size of the embedding.
     :param frequencies: The frequencies f_i in turns per unit of time, or how many to draw from
-        N(0, ``frequency_scale``^2); half the embedding's size if not given.
+        ``N(0, frequency_scale^2)``; half the embedding's size if not given.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
     :param activation_fn: Activation of the MLP.
     :raises ValueError: If there are no frequencies.

@@ -10,39 +10,39 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("gymnasium_robotics")
 
 from sb3_policyflow.benchmark import multigoal, playground, pointmaze
-from sb3_policyflow.benchmark.panels import Panels, panel_cells
+from sb3_policyflow.benchmark.variants import Variants, variant_runs
 from sb3_policyflow.envs.point_maze import ENV_ID
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 
 
-def n_done(folder: str, panels: Panels, n_evaluations: int, steps: int, **fields: Any) -> int:
+def n_done(folder: str, variants: Variants, n_evaluations: int, steps: int, **fields: Any) -> int:
     """How many trainings of three seeds have been run; other settings are an error."""
-    arguments = Namespace(panels=panels, seeds=[0, 1, 2], steps=steps)
+    arguments = Namespace(variants=variants, seeds=[0, 1, 2], steps=steps)
     arguments.evaluations, arguments.episodes = n_evaluations, 2 * n_evaluations
-    cells = panel_cells(panels, arguments, **fields)
-    return sum(cell.is_done(RESULTS / folder) for cell in cells)
+    runs = variant_runs(variants, arguments, **fields)
+    return sum(run.is_done(RESULTS / folder) for run in runs)
 
 
 def test_multigoal() -> None:
     fields = {"env": multigoal.ENV, "n_trajectories": multigoal.N_TRAJECTORIES}
-    assert n_done("multigoal", multigoal.PANELS, 10, 3_000_000, **fields) == 18
+    assert n_done("multigoal", multigoal.VARIANTS, 10, 3_000_000, **fields) == 18
 
 
 def test_pointmaze() -> None:
     fields = {"env": ENV_ID, "keep_visits": True}
-    assert n_done("pointmaze", pointmaze.PANELS, 10, 2_000_000, **fields) == 9
+    assert n_done("pointmaze", pointmaze.VARIANTS, 10, 2_000_000, **fields) == 9
 
 
 @pytest.mark.parametrize("task", playground.TASKS)
 def test_playground(task: str) -> None:
     env = f"Playground/{task}-v0"
-    assert n_done("playground", playground.PANELS, 5, 3_000_000, env=env) == 15
+    assert n_done("playground", playground.VARIANTS, 5, 3_000_000, env=env) == 15
 
 
 @pytest.mark.parametrize("task", ["ReacherEasy", "FingerTurnEasy", "BallInCup", "WalkerWalk"])
 def test_playground_held_out(task: str) -> None:
     names = ("policyflow", "policyflow-latent0.3", "ppo")
-    panels = {name: playground.PANELS[name] for name in names}
+    variants = {name: playground.VARIANTS[name] for name in names}
     env = f"Playground/{task}-v0"
-    assert n_done("playground-held-out", panels, 5, 3_000_000, env=env) == 9
+    assert n_done("playground-held-out", variants, 5, 3_000_000, env=env) == 9

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_policyflow.benchmark import environments
 from sb3_policyflow.benchmark.__main__ import main
+from sb3_policyflow.benchmark.speed import environments
 
 
 def test_each_environment_and_size_is_timed(
@@ -24,7 +24,8 @@ def test_each_environment_and_size_is_timed(
         assert len(timing["rounds"]) == environments.N_ROUNDS
         assert timing["steps_per_second"] == statistics.median(timing["rounds"])
     assert figures["machine"]["cores"] >= 1
-    header, _, *rows = capsys.readouterr().out.strip().splitlines()
+    header, _, *rows, said = capsys.readouterr().out.strip().splitlines()
+    assert said == f"Wrote {path}."
     assert header.startswith("| steps per second | 2 | 16 |")
     for row, row_id in zip(rows, ids, strict=True):
         cells = row.strip("| ").split(" | ")

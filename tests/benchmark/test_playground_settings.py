@@ -9,13 +9,13 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow.benchmark.experiment import make_experiment
-from sb3_policyflow.benchmark.playground import PANELS, ROLLOUTS
+from sb3_policyflow.benchmark.playground import ROLLOUTS, VARIANTS
 
 
-@pytest.mark.parametrize("name", PANELS)
+@pytest.mark.parametrize("name", VARIANTS)
 def test_each_algorithm_takes_its_settings(name: str, tmp_path: Path) -> None:
     """In another environment, with rollouts of the same size for all."""
-    algo, hyperparams = PANELS[name].algo, PANELS[name].hyperparams
+    algo, hyperparams = VARIANTS[name].algo, VARIANTS[name].hyperparams
     # This environment's learning rate follows the divergence, which allows no schedule.
     pendulum = {"desired_kl": None} if algo == "policyflow" else {}
     manager = make_experiment(algo, "Pendulum-v1", 16384, 0, str(tmp_path), hyperparams | pendulum)

@@ -10,14 +10,14 @@ import pytest
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("gymnasium_robotics")
 
-from sb3_policyflow.benchmark.visits import VisitMap
+from sb3_policyflow.benchmark.measure.visits import VisitMap
 from sb3_policyflow.envs.point_maze import ENV_ID
 
 
 def test_command(tmp_path: Path) -> None:
-    """Two seeds of two panels, hardly trained; a second call only draws."""
+    """Two seeds of two variants, hardly trained; a second call only draws."""
     command = [sys.executable, "-m", "sb3_policyflow.benchmark", "pointmaze", "--out", tmp_path]
-    command += ["--panels", "b-ppo", "d-brownian", "--seeds", "0", "1", "--jobs", "2"]
+    command += ["--variants", "b-ppo", "d-brownian", "--seeds", "0", "1", "--jobs", "2"]
     command += ["--steps", "2048", "--evaluations", "1", "--episodes", "1"]
     subprocess.run(command, check=True, capture_output=True)
     assert (tmp_path / "pointmaze.png").stat().st_size > 20_000

@@ -8,20 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.benchmark import costs
 from sb3_policyflow.benchmark.__main__ import main
-from sb3_policyflow.benchmark.cell import _train
-from sb3_policyflow.benchmark.evaluation import EvaluationCallback, evaluate, modes
-from sb3_policyflow.benchmark.plot import curves_figure
-from sb3_policyflow.benchmark.results import Cell, Result, ResultsError, load_results
-from sb3_policyflow.benchmark.table import improvement_table, overall_table, results_table
+from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.benchmark.figures.plot import curves_figure
+from sb3_policyflow.benchmark.measure import costs
+from sb3_policyflow.benchmark.measure.evaluation import EvaluationCallback, evaluate, modes
+from sb3_policyflow.benchmark.report.table import comparison_table, overall_table, results_table
+from sb3_policyflow.benchmark.results import Result, Run, load_results
+from sb3_policyflow.benchmark.train_one import train_and_measure
 
 
 def benchmark(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -41,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     outcome = run(path, "fpo", "ppo", "--jobs", "2")
     assert outcome.returncode == 0, outcome.stderr
     assert "2/2" in outcome.stderr
+    assert outcome.stdout == f"2 of 2 results are in {path}.\n"
     return path
 
 
@@ -53,7 +55,7 @@ def test_what_is_written(folder: Path) -> None:
         ["stochastic", "latent-only", "deterministic"],
         ["stochastic", "deterministic"],
     ]
-    # One rollout of 8 times 512 steps, ten epochs in minibatches of 128, eight probes.
+    # One rollout of 8 times 512 steps, ten epochs in minibatches of 128, eight samples each.
     assert fpo.summary["timesteps"] == 4096
     assert fpo.summary["gradient_steps"] == 320
     assert fpo.summary["network_evaluations"] == {"acting": 40960, "updating": 320 * 128 * 8}
@@ -79,7 +81,7 @@ def test_hyperparams_of_the_command(tmp_path: Path) -> None:
     outcome = run(tmp_path, "policyflow", "ppo", *settings)
     assert outcome.returncode == 0, outcome.stderr
     for result in load_results(tmp_path):
-        assert result.cell.hyperparams["n_steps"] == 8
+        assert result.run.hyperparams["n_steps"] == 8
         assert result.summary["timesteps"] == 16
         assert result.summary["hyperparams"]["policy_kwargs"] == "dict(net_arch=[4])"
 
@@ -93,7 +95,7 @@ def test_a_falling_learning_rate_ends_at_zero_not_below() -> None:
 
     env = make_vec_env("Pendulum-v1", 2)
     model = PPO("MlpPolicy", env, schedule, n_steps=8, batch_size=16, device="cpu")
-    summary = _train(model, 40, EvaluationCallback(env, [40], n_episodes=1), [])
+    summary = train_and_measure(model, 40, EvaluationCallback(env, [40], n_episodes=1), [])
     assert summary["timesteps"] == 48
     assert min(remaining) == 0
 
@@ -104,7 +106,7 @@ def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[
     assert "was made with other settings" in capsys.readouterr().err
 
 
-def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
+def test_a_failing_run_is_reported_and_its_log_kept(tmp_path: Path) -> None:
     outcome = run(tmp_path, "fpo", "--hyperparams", "n_steps:-1")
     assert outcome.returncode == 1
     assert "failed: fpo Pendulum-v1 seed 0" in outcome.stderr
@@ -114,7 +116,7 @@ def test_a_failing_cell_is_reported_and_its_log_kept(tmp_path: Path) -> None:
 
 
 def test_a_figure_says_what_failed_though_there_is_nothing_to_draw(tmp_path: Path) -> None:
-    settings = ["--steps", "10", "--panels", "a-ppo", "--out", str(tmp_path)]
+    settings = ["--steps", "10", "--variants", "a-ppo", "--out", str(tmp_path)]
     # No evaluation after -1 episodes: the training fails.
     outcome = benchmark("multigoal", *settings, "--episodes", "-1")
     assert outcome.returncode == 2
@@ -134,30 +136,59 @@ def test_environments_that_there_are_not_are_named_before_a_training(
     assert not list(tmp_path.iterdir())
 
 
+def test_an_unknown_algorithm_is_refused_with_the_choices(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--algos", "pfo", "--envs", "Pendulum-v1", "--steps", "10"])
+    assert "choose from" in (said := capsys.readouterr().err)
+    assert "policyflow" in said
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [("pointmaze", "gymnasium_robotics"), ("playground", "mujoco_playground")],
+)
+def test_a_missing_extra_is_named_before_a_training(
+    command: str,
+    module: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main([command, "--out", str(tmp_path)]) == 2
+    assert f"needs {module}: pip install" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_results_of_some_environments(tmp_path: Path) -> None:
     for env in ("Pendulum-v1", "Acrobot-v1"):
         result("ours", 0, 1.0, env).save(tmp_path)
-    assert [run.cell.env for run in load_results(tmp_path, ["Acrobot-v1"])] == ["Acrobot-v1"]
-    with pytest.raises(ResultsError, match="No results of CartPole-v1"):
+    assert [r.run.env for r in load_results(tmp_path, ["Acrobot-v1"])] == ["Acrobot-v1"]
+    with pytest.raises(BenchmarkError, match="No results of CartPole-v1"):
         load_results(tmp_path, ["CartPole-v1"])
 
 
 def test_there_is_no_curve_of_seeds_that_were_evaluated_at_different_timesteps() -> None:
     def curve(seed: int, *timesteps: float) -> Result:
         rows = [{"timesteps": t, "mode": "stochastic", "mean_return": t} for t in timesteps]
-        cell = Cell("ours", "ppo", "Pendulum-v1", seed, 100)
-        return Result(cell, {"final": {}}, rows)
+        settings = Run("ours", "ppo", "Pendulum-v1", seed, 100)
+        return Result(settings, {"final": {}}, rows)
 
     lines = curves_figure([curve(0, 50, 100), curve(1, 50, 100)]).axes[0].lines
     assert lines[0].get_xydata().tolist() == [[50, 50], [100, 100]]  # type: ignore[union-attr]
-    with pytest.raises(ResultsError, match="ours in Pendulum-v1 were not evaluated at the same"):
+    with pytest.raises(BenchmarkError, match="ours in Pendulum-v1 were not evaluated at the same"):
         curves_figure([curve(0, 50, 100), curve(1, 500, 1000)])
 
 
-def test_table_and_plot(folder: Path, tmp_path: Path) -> None:
+def test_table_and_plot(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["table", str(folder), "--out", str(tmp_path / "table.md")]) == 0
+    assert capsys.readouterr().out == f"Wrote {tmp_path / 'table.md'}.\n"
     assert "| Pendulum-v1, 10 steps | fpo | 1 |" in (tmp_path / "table.md").read_text()
     assert main(["plot", str(folder), "--out", str(tmp_path)]) == 0
+    written = [tmp_path / name for name in ("curves.png", "improvement.png")]
+    assert capsys.readouterr().out == f"Wrote {written[0]} and {written[1]}.\n"
     assert (tmp_path / "curves.png").stat().st_size > 10_000
     assert (tmp_path / "improvement.png").stat().st_size > 5_000
 
@@ -183,17 +214,19 @@ def result(name: str, seed: int, value: float, env: str = "Pendulum-v1") -> Resu
         "network_evaluations": {"acting": 1e6, "updating": 2e6},
         "seconds": {"training": 90.0},
     }
-    return Result(Cell(name, name, env, seed, 100), summary, [])
+    return Result(Run(name, name, env, seed, 100), summary, [])
 
 
 def test_tables_by_hand() -> None:
     results = [result("ours", seed, value) for seed, value in enumerate([1.0, 3.0, 5.0, 99.0])]
-    results += [result("theirs", seed, value) for seed, value in enumerate([0.0, 2.0, 4.0])]
+    results += [result("theirs", seed, float(seed)) for seed in range(5)]
     ours, theirs = results_table(results).splitlines()[2:]
-    assert ours.startswith("| Pendulum-v1, 1e+02 steps | ours | 4 | 4 [")
+    assert ours.startswith("| Pendulum-v1, 1e+02 steps | ours | 4 | 27 (1 to 99) |")
     assert ours.endswith("| - | - | 1,000 | 1.0 M / 2.0 M | 1.5 |")
-    assert "| theirs | 3 |" in theirs
-    assert "| ours | theirs | 0.75 [" in improvement_table(results)
+    assert "| theirs | 5 | 2 [" in theirs
+    assert "| ours | theirs | 0.75 (15 of 20) |" in comparison_table(results)
+    results.append(result("ours", 4, 2.0))
+    assert "| ours | theirs | 0.70 [" in comparison_table(results)
 
 
 def test_a_benchmark_that_is_not_complete_is_compared_by_what_it_has() -> None:
@@ -204,11 +237,11 @@ def test_a_benchmark_that_is_not_complete_is_compared_by_what_it_has() -> None:
     # Of "ours" over both environments: seed 0, with 1 in each.
     assert "| ours | 2 x 1 | 1 | - | - |" in overall_table(results)
     # Seed 0 only, of both environments: ours is worse in each. Seed 1, better, does not count.
-    assert "| ours | theirs | 0 |" in improvement_table(results)
+    assert "| ours | theirs | 0.00 (0 of 2) |" in comparison_table(results)
     # An environment that only one of them has leaves the others as they are.
     results += [result("ours", 7, 9.0, "CartPole-v1"), result("alone", 0, 9.0, "CartPole-v1")]
-    assert "| ours | theirs | 0 |" in improvement_table(results)
-    assert "| alone | theirs |" not in improvement_table(results)
+    assert "| ours | theirs | 0.00 (0 of 2) |" in comparison_table(results)
+    assert "| alone | theirs |" not in comparison_table(results)
     assert "| theirs | 0 x 0 | - | - | - |" in overall_table(results)
 
 
@@ -221,12 +254,17 @@ def test_overall_table_by_hand() -> None:
 
 def test_results_survive_saving(tmp_path: Path) -> None:
     row = {"timesteps": 10.0, "mode": "stochastic", "mean_return": -1.5, "std_return": 0.5}
-    saved = Result(Cell("a", "ppo", "Env-v0", 3, 10, {"n_envs": 2}), {"final": {}}, [row])
+    saved = Result(Run("a", "ppo", "Env-v0", 3, 10, {"n_envs": 2}), {"final": {}}, [row])
     row |= {"mean_length": 7.0, "n_episodes": 4.0}
     saved.save(tmp_path)
     assert load_results(tmp_path) == [saved]
-    assert saved.cell.is_done(tmp_path)
-    assert json.loads((tmp_path / "a/Env-v0/seed-3.json").read_text())["cell"]["algo"] == "ppo"
+    assert saved.run.is_done(tmp_path)
+    path = tmp_path / "a/Env-v0/seed-3.json"
+    assert json.loads(path.read_text())["run"]["algo"] == "ppo"
+    # As version 0.1.0 wrote it.
+    path.write_text(path.read_text().replace('"run": {', '"cell": {'))
+    assert load_results(tmp_path) == [saved]
+    assert saved.run.is_done(tmp_path)
 
 
 def test_evaluation_leaves_the_training_alone() -> None:
@@ -248,13 +286,15 @@ def test_evaluation_leaves_the_training_alone() -> None:
 
 def test_costs() -> None:
     small: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
-    flow = PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small)
-    assert costs.evaluations_per_action(flow) == 24
-    assert costs.evaluations_per_sample(flow) == 6
-    chain = DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small)
-    assert costs.evaluations_per_action(chain) == 10
-    assert costs.evaluations_per_sample(chain) == 4
-    steps = costs.GradientSteps(chain)
-    chain.learn(32)
-    assert steps.count == 4
-    assert costs.network_evaluations(chain, steps.count) == {"acting": 320, "updating": 4 * 8 * 4}
+    for algorithm, per_action, per_sample in [
+        (PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small), 24, 6),
+        (DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small), 10, 4),
+        (PPO("MlpPolicy", "Pendulum-v1", **small), 1, 1),
+    ]:
+        steps = costs.GradientSteps(algorithm)
+        algorithm.learn(32)
+        assert steps.count == 4
+        found = costs.network_evaluations(algorithm, steps.count)
+        assert found == {"acting": 32 * per_action, "updating": 4 * 8 * per_sample}
+    whole = A2C("MlpPolicy", "Pendulum-v1", n_steps=16)
+    assert costs.network_evaluations(whole, 2)["updating"] == 2 * 16

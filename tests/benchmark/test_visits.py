@@ -1,20 +1,19 @@
 """Visit maps of the maze: counted by hand, over real trainings, and drawn."""
 
+from pathlib import Path
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 pytest.importorskip("gymnasium_robotics")
 
-from sb3_policyflow.benchmark.visits import (
-    CELL_SIZE,
-    VisitCounter,
-    VisitMap,
-    density_figure,
-)
+from sb3_policyflow.benchmark.figures.visits import density_figure
+from sb3_policyflow.benchmark.measure.visits import CELL_SIZE, VisitCounter, VisitMap
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.envs.point_maze import ENV_ID
 
@@ -24,31 +23,31 @@ FREE = np.array([[True, True, False], [True, False, True]])
 class Recorder(gym.Wrapper):
     """Keeps the positions after each step, and shortens the episodes."""
 
-    def __init__(self, env):
+    def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self.positions = []
+        self.positions: list[np.ndarray] = []
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> Any:
         observation, reward, terminated, _, info = self.env.step(action)
         self.positions.append(observation[:2].copy())
         return observation, reward, terminated, len(self.positions) % 10 == 0, info
 
 
-def test_numbers_by_hand():
+def test_numbers_by_hand() -> None:
     visits = VisitMap(np.array([[2, 2, 0], [0, 0, 4]]), FREE)
     assert visits.coverage == 0.75
     assert visits.entropy == pytest.approx(1.5 * np.log(2) / np.log(4))
     np.testing.assert_array_equal(visits.density, [[1, 1, np.nan], [0, np.nan, 2]])
 
 
-def test_nothing_visited_and_all_alike():
+def test_nothing_visited_and_all_alike() -> None:
     nothing, alike = VisitMap(np.zeros((2, 3), int), FREE), VisitMap(7 * FREE.astype(int), FREE)
     assert (nothing.coverage, nothing.entropy) == (0.0, 0.0)
     assert (alike.coverage, alike.entropy) == (1.0, pytest.approx(1.0))
     assert np.nanmax(nothing.density) == 0.0
 
 
-def test_save_and_load(tmp_path):
+def test_save_and_load(tmp_path: Path) -> None:
     visits = VisitMap(np.arange(6).reshape(2, 3), FREE)
     visits.save(tmp_path / "visits.npz")
     loaded = VisitMap.load(tmp_path / "visits.npz")
@@ -56,18 +55,18 @@ def test_save_and_load(tmp_path):
     np.testing.assert_array_equal(loaded.free, visits.free)
 
 
-def model_on(env):
+def model_on(env: VecEnv) -> PPO:
     return PPO("MlpPolicy", env, n_steps=64, batch_size=64, n_epochs=1, seed=0, device="cpu")
 
 
-def counted(model, total_timesteps):
+def counted(model: PPO, total_timesteps: int) -> VisitMap:
     counter = VisitCounter()
     model.learn(total_timesteps, callback=counter)
     return counter.visits()
 
 
 @pytest.mark.parametrize("normalized", [False, True])
-def test_counts_where_each_step_of_a_training_ended(normalized):
+def test_counts_where_each_step_of_a_training_ended(normalized: bool) -> None:
     env = make_vec_env(ENV_ID, n_envs=2, seed=0, wrapper_class=Recorder)
     model = model_on(VecNormalize(env) if normalized else env)
     visits = counted(model, 512)
@@ -81,14 +80,14 @@ def test_counts_where_each_step_of_a_training_ended(normalized):
     assert 0 < visits.coverage < 1
 
 
-def test_free_cells_are_the_mazes_sixteen_to_one():
+def test_free_cells_are_the_mazes_sixteen_to_one() -> None:
     visits = VisitCounter().visits()
     assert visits.free.sum() == 26 * 16
     assert visits.free[4, 4], "the start's cell"
     assert not visits.free[0].any()
 
 
-def test_counts_the_stock_mazes_dictionary_observations():
+def test_counts_the_stock_mazes_dictionary_observations() -> None:
     stock = "PointMaze_Medium_Diverse_GDense-v3"
     ensure_registered(stock)
     env = make_vec_env(stock, n_envs=2, seed=0)
@@ -97,7 +96,7 @@ def test_counts_the_stock_mazes_dictionary_observations():
     assert visits.counts[4:8, 4:8].sum() == 32, "all near the start after 16 steps"
 
 
-def test_figure_has_a_panel_for_each_run_on_one_scale():
+def test_figure_has_a_panel_for_each_run_on_one_scale() -> None:
     empty = VisitCounter().visits()
     all_alike = VisitMap(empty.free.astype(int), empty.free)
     figure = density_figure({"none": empty, "all": all_alike, "both": [empty, all_alike]})

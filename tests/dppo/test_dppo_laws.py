@@ -11,7 +11,9 @@ from stable_baselines3.common.envs import FakeImageEnv
 from torch.distributions import Normal
 
 from sb3_policyflow import DPPO
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.update import UpdateMetrics
+from sb3_policyflow.dppo.dppo import DPPOUpdate
 from sb3_policyflow.dppo.policies import DPPORecord
 
 N_SAMPLES = 64
@@ -36,11 +38,12 @@ def collected(**options: Any) -> tuple[DPPO, FlowRolloutBufferSamples]:
         model.rollout_buffer,
         N_SAMPLES,
     )
-    return model, model._rollout()
+    return model, model.rollout_buffer.samples()
 
 
 def terms(model: DPPO, batch: FlowRolloutBufferSamples) -> Any:
-    return model._policy_terms(batch, model.policy.actor_features(batch.observations), None)
+    features = model.policy.actor_features(batch.observations)
+    return DPPOUpdate(model).terms(batch, features)
 
 
 def perturb(model: DPPO, scale: float = 0.02) -> None:
@@ -73,12 +76,12 @@ def test_log_prob_of_the_chain_is_that_of_its_gaussians(process: str) -> None:
         for step in range(10):
             points = record.points[:, step]
             outputs = policy.velocity(points, th.tensor(step / 10), features)
-            mean = policy.process.means(points, outputs, step)
-            std = max(policy.process.stds[step].item(), 0.1)
+            mean = policy.chain.means(points, outputs, step)
+            std = max(policy.chain.stds[step].item(), 0.1)
             expected += Normal(mean, std).log_prob(record.points[:, step + 1]).sum(-1)
-    log_probs = model._log_probs(record, means)
+    log_probs = DPPOUpdate(model).log_probs(record, means)
     th.testing.assert_close(log_probs.sum(-1), expected, atol=1e-3, rtol=1e-4)
-    old = model._log_probs(record, record.means)
+    old = DPPOUpdate(model).log_probs(record, record.means)
     th.testing.assert_close(terms(model, rollout).log_ratio, log_probs - old)
 
 
@@ -86,7 +89,7 @@ def test_one_step_is_a_gaussian_policy_at_the_floor_std() -> None:
     options = {"n_denoising_steps": 1, "log_prob_clamp": None, "log_prob_reduction": "sum"}
     model, rollout = collected(min_sampling_std=0.3, min_log_prob_std=0.3, **options)
     record: DPPORecord = rollout.record
-    assert model.policy.process.stds.tolist() == [0.0]
+    assert model.policy.chain.stds.tolist() == [0.0]
     noise = record.points[:, 1] - record.means[:, 0]
     assert noise.std().item() == pytest.approx(0.3, rel=0.25)
     th.testing.assert_close(rollout.actions, record.points[:, 1].clamp(-1, 1))
@@ -119,25 +122,26 @@ def test_log_probs_are_clamped_before_they_are_reduced() -> None:
     # log N(0; 0, 0.1^2) = 1.38 stays, that of 9 is far below -5.
     record = DPPORecord(points, means)
     expected = (Normal(0.0, 0.1).log_prob(th.tensor(0.0)).item() - 5) / 2
-    assert model._log_probs(record, means).item() == pytest.approx(expected, rel=1e-5)
+    assert DPPOUpdate(model).log_probs(record, means).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_later_steps_weigh_more_and_are_clipped_later() -> None:
     model, _ = collected(
         denoising_gamma=0.5, clip_range_base=0.01, clip_range=0.2, n_denoising_steps=3
     )
-    clip_ranges = model._clip_range_now()
+    update = DPPOUpdate(model)
+    clip_ranges = update.clip_range
     assert isinstance(clip_ranges, th.Tensor)
     middle = 0.01 + 0.19 * (np.exp(1.5) - 1) / (np.exp(3) - 1)
     th.testing.assert_close(clip_ranges, th.tensor([0.01, middle, 0.2], dtype=th.float32))
-    objective = model._surrogate(th.full((1, 3), 5.0), th.tensor([2.0]))
-    expected = th.tensor([[0.25 * 1.01, 0.5 * (1 + middle), 1.2]], dtype=th.float32) * 2
-    th.testing.assert_close(objective, expected)
+    loss = update.surrogate_loss(th.full((1, 3), 5.0), th.tensor([2.0]), UpdateMetrics())
+    expected = 2 * (0.25 * 1.01 + 0.5 * (1 + middle) + 1.2) / 3
+    assert loss.item() == pytest.approx(-expected)
 
 
 def test_a_single_step_has_the_last_clip_range() -> None:
     model, _ = collected(clip_range_base=0.01, n_denoising_steps=1)
-    assert model._clip_range_now() == pytest.approx(0.2)
+    assert float(DPPOUpdate(model).clip_range) == pytest.approx(0.2)
 
 
 def test_only_the_last_steps_are_trained() -> None:
@@ -197,9 +201,11 @@ def test_the_critic_warms_up_without_the_extractor_of_the_actor(share: bool) -> 
 def test_warming_up_takes_rollouts_however_long_their_updates() -> None:
     model, _ = collected(n_critic_warmup=2)
     model.n_epochs = 4
-    assert model._is_critic_warming_up
+    untrained = model.policy.velocity.output.weight.clone()
     model.train()
-    assert not model._is_critic_warming_up
+    assert th.equal(model.policy.velocity.output.weight, untrained)
+    model.train()
+    assert not th.equal(model.policy.velocity.output.weight, untrained)
 
 
 def test_frozen_steps_do_not_follow_the_extractor() -> None:
@@ -210,7 +216,7 @@ def test_frozen_steps_do_not_follow_the_extractor() -> None:
         with th.no_grad():
             features = model.policy.actor_features(obs)
             points = th.zeros(1, model.policy.action_dim)  # where no bound hides a change
-            first, last = (model.policy._means(points, step, features) for step in (7, 8))
+            first, last = (model.policy.step_means(points, step, features) for step in (7, 8))
         return first, last
 
     (frozen, trained), _ = means(), model.learn(3 * 32)

@@ -1,64 +1,60 @@
 """MuJoCo Playground's tasks against the engine itself. `make test-playground` runs these."""
 
-import importlib.metadata
 import os
 import subprocess
 import sys
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from numpy.typing import NDArray
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import sb3_policyflow
 from sb3_policyflow.envs import PLAYGROUND_TASKS, ensure_registered
-from sb3_policyflow.envs.playground import PlaygroundEnv, PlaygroundVecEnv, PlaygroundVectorEnv
+from sb3_policyflow.envs.playground import PlaygroundVecEnv, PlaygroundVectorEnv
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 pytest.importorskip("mujoco_playground", reason="playground is not installed")
 
 import jax
-import jax.numpy
-from mujoco_playground import dm_control_suite, registry
-from mujoco_playground._src.dm_control_suite import cartpole
-from mujoco_playground._src.mjx_env import MENAGERIE_PATH
+from mujoco_playground import registry
 
-from sb3_policyflow.envs.playground.batch import all_tasks, task_config
+pytestmark = pytest.mark.slow
 
-STOCK_TASKS = all_tasks()
-"""Before tests add more."""
 N_ENVS, LIMIT = 4, 5
 CARTPOLE = "CartpoleBalance"
 
 
-def engine(task):
+def engine(task: str) -> Any:
     return registry.load(task, config_overrides={"impl": "jax"})
 
 
-def row(tree, index):
+def row(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def draw_actions(env, n_steps, seed=0):
+def draw_actions(env: Any, n_steps: int, seed: int = 0) -> NDArray[np.float64]:
     return np.random.default_rng(seed).uniform(-1, 1, (n_steps, *env.action_space.shape))
 
 
 @pytest.fixture(scope="module")
-def cartpoles():
+def cartpoles() -> PlaygroundVectorEnv:
     """One small batch with short episodes for many tests: each compilation takes seconds."""
     return PlaygroundVectorEnv(CARTPOLE, N_ENVS, max_episode_steps=LIMIT)
 
 
 @pytest.fixture(scope="module")
-def engine_step():
+def engine_step() -> Any:
     return jax.jit(engine(CARTPOLE).step)
 
 
 @pytest.mark.parametrize("task", PLAYGROUND_TASKS)
-def test_steps_as_the_engine_does(task):
+def test_steps_as_the_engine_does(task: str) -> None:
     """From each state that is passed through: small differences of contacts would add up."""
     env = gym.make_vec(f"Playground/{task}-v0", 2)
     theirs = engine(task)
@@ -80,7 +76,9 @@ def test_steps_as_the_engine_does(task):
             np.testing.assert_allclose(rewards[i], expected.reward, rtol=1e-4, atol=1e-5)
 
 
-def test_the_limit_truncates_and_resets_at_its_step(cartpoles, engine_step):
+def test_the_limit_truncates_and_resets_at_its_step(
+    cartpoles: PlaygroundVectorEnv, engine_step: Any
+) -> None:
     first, _ = cartpoles.reset(seed=0)
     actions = draw_actions(cartpoles, LIMIT).astype(np.float32)
     for action in actions[:-1]:
@@ -103,7 +101,7 @@ def test_the_limit_truncates_and_resets_at_its_step(cartpoles, engine_step):
     assert not cartpoles.step(actions[0])[3].any(), "the clock starts anew"
 
 
-def starts(env, seed, n_episodes):
+def starts(env: Any, seed: int, n_episodes: int) -> NDArray[np.float32]:
     """Observations that episodes start with, shape (n_episodes, num_envs, obs_dim)."""
     found = [env.reset(seed=seed)[0]]
     for action in draw_actions(env, LIMIT * (n_episodes - 1)):
@@ -113,13 +111,13 @@ def starts(env, seed, n_episodes):
     return np.array(found)
 
 
-def test_each_episode_starts_in_a_state_of_its_own(cartpoles):
+def test_each_episode_starts_in_a_state_of_its_own(cartpoles: PlaygroundVectorEnv) -> None:
     found = starts(cartpoles, 0, 6)
     assert found.shape == (6, N_ENVS, 5)
     assert len(np.unique(found.reshape(-1, 5), axis=0)) == 6 * N_ENVS
 
 
-def test_a_seed_repeats_and_another_differs(cartpoles):
+def test_a_seed_repeats_and_another_differs(cartpoles: PlaygroundVectorEnv) -> None:
     once, again, other = starts(cartpoles, 7, 3), starts(cartpoles, 7, 3), starts(cartpoles, 8, 3)
     np.testing.assert_array_equal(once, again)
     assert (once != other).any(axis=-1).all()
@@ -127,13 +125,13 @@ def test_a_seed_repeats_and_another_differs(cartpoles):
     assert (unseeded[0] != unseeded[1]).any()
 
 
-def ends(env, n_steps):
+def ends(env: Any, n_steps: int) -> list[list[int]]:
     """The steps, from 1, at which each environment's episodes end."""
     dones = [env.step(np.zeros((N_ENVS, 1)))[2] for _ in range(n_steps)]
     return [(np.flatnonzero(column) + 1).tolist() for column in np.array(dones).T]
 
 
-def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
+def test_first_episodes_end_at_random_steps_if_asked(cartpoles: PlaygroundVectorEnv) -> None:
     env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
     found = []
     for seed in (0, 1, 2, 3, 4, 0):
@@ -149,7 +147,9 @@ def test_first_episodes_end_at_random_steps_if_asked(cartpoles):
     assert ends(env, 2 * LIMIT) == [[LIMIT, 2 * LIMIT]] * N_ENVS
 
 
-def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
+def test_a_broken_simulation_ends_that_episode_only(
+    cartpoles: PlaygroundVectorEnv, engine_step: Any
+) -> None:
     cartpoles.reset(seed=0)
     actions = draw_actions(cartpoles, 2 + LIMIT).astype(np.float32)
     cartpoles.step(actions[0])
@@ -172,7 +172,7 @@ def test_a_broken_simulation_ends_that_episode_only(cartpoles, engine_step):
     assert ends.sum(axis=0).tolist() == [1, 1, 1, 1]
 
 
-def test_sb3_sees_the_ends_of_episodes(cartpoles):
+def test_sb3_sees_the_ends_of_episodes(cartpoles: PlaygroundVectorEnv) -> None:
     cartpoles.reset(seed=0)
     env = VecMonitor(GymVectorVecEnv(cartpoles))
     env.reset()
@@ -190,7 +190,7 @@ def test_sb3_sees_the_ends_of_episodes(cartpoles):
     assert steps[-1][3][0]["episode"]["l"] == LIMIT
 
 
-def test_a_step_is_traced_once(monkeypatch):
+def test_a_step_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     env = PlaygroundVectorEnv("PendulumSwingup", 2, max_episode_steps=3)
     traced = []
     original = env.batch.env.step
@@ -206,7 +206,7 @@ def test_a_step_is_traced_once(monkeypatch):
     assert len(traced) == n_traced
 
 
-def test_policyflow_learns_with_normalization(cartpoles):
+def test_policyflow_learns_with_normalization(cartpoles: PlaygroundVectorEnv) -> None:
     env = VecNormalize(VecMonitor(GymVectorVecEnv(cartpoles)))
     model = sb3_policyflow.PolicyFlow("MlpPolicy", env, n_steps=16, batch_size=32, n_epochs=2)
     before = [parameter.clone() for parameter in model.policy.parameters()]
@@ -220,7 +220,7 @@ def test_policyflow_learns_with_normalization(cartpoles):
     assert np.isfinite(env.obs_rms.mean).all()
 
 
-def test_tensors_share_memory_and_equal_arrays(cartpoles):
+def test_tensors_share_memory_and_equal_arrays(cartpoles: PlaygroundVectorEnv) -> None:
     actions = draw_actions(cartpoles, 2 * LIMIT).astype(np.float32)
     first, _ = cartpoles.reset(seed=4)
     arrays = [cartpoles.step(action) for action in actions]
@@ -240,7 +240,7 @@ def test_tensors_share_memory_and_equal_arrays(cartpoles):
 
 
 @pytest.mark.filterwarnings("ignore:.*not within the observation space|.*gym.make.*")
-def test_check_env():
+def test_check_env() -> None:
     env = gym.make(f"Playground/{CARTPOLE}-v0", max_episode_steps=20)
     sb3_check_env(env)
     gymnasium_check_env(env.unwrapped, skip_render_check=True)
@@ -253,89 +253,7 @@ def test_check_env():
     assert (type(terminated), type(truncated)) == (bool, bool)
 
 
-def test_the_task_settings_can_be_changed():
-    env = PlaygroundEnv(CARTPOLE, config_overrides={"action_repeat": 2, "episode_length": 6})
-    plain = PlaygroundEnv(CARTPOLE)
-    np.testing.assert_array_equal(env.reset(seed=0)[0], plain.reset(seed=0)[0])
-    for step in range(3):
-        action = np.array([0.3 * step], np.float32)
-        observation, reward, _, truncated, _ = env.step(action)
-        *_, first_reward, _, _, _ = plain.step(action)
-        expected, second_reward, _, _, _ = plain.step(action)
-        np.testing.assert_allclose(observation, expected, rtol=1e-4, atol=1e-5)
-        assert reward == pytest.approx(first_reward + second_reward, rel=1e-5)
-        assert truncated == (step == 2)
-    with pytest.raises(ValueError, match=r"no setting 'sim_td'.*: it has .*sim_dt"):
-        PlaygroundEnv(CARTPOLE, config_overrides={"sim_td": 0.1})
-
-
-ROBOT = "Go1JoystickFlatTerrain"
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {"reward_config.scales.tracking_lin_vel": 9.0},
-        {"reward_config": {"scales": {"tracking_lin_vel": 9.0}}},
-    ],
-)
-def test_settings_within_settings_can_be_changed(overrides):
-    before = task_config(ROBOT, {}).to_dict()
-    after = task_config(ROBOT, overrides).to_dict()
-    before["reward_config"]["scales"]["tracking_lin_vel"] = 9.0
-    assert after == before
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"reward_config.scales.speed": 1}, "reward_config.scales has .*tracking_lin_vel"),
-        (
-            {"reward_config": {"scalse": {"speed": 1}}},
-            "'reward_config.scalse.speed'.*reward_config",
-        ),
-        ({"sim_dt.speed": 1}, "sim_dt has no settings in it"),
-    ],
-)
-def test_settings_that_there_are_not_are_refused(overrides, message):
-    with pytest.raises(ValueError, match=message):
-        task_config(ROBOT, overrides)
-
-
-class EndsAtOnce(cartpole.Balance):
-    """A task whose episodes end with their first step, which pays 1, as each later one would."""
-
-    def step(self, state, action):
-        after = super().step(state, action)
-        return after.replace(reward=jax.numpy.ones(()), done=jax.numpy.ones(()))
-
-
-def test_a_task_that_ends_within_repeated_actions_stops_there():
-    def make(**kwargs):
-        return EndsAtOnce(swing_up=False, sparse=False, **kwargs)
-
-    dm_control_suite.register_environment("EndsAtOnce", make, cartpole.default_config)
-    once = PlaygroundVectorEnv("EndsAtOnce", 2)
-    thrice = PlaygroundVectorEnv("EndsAtOnce", 2, config_overrides={"action_repeat": 3})
-    for env in (once, thrice):
-        env.reset(seed=0)
-    expected, found = (env.step(np.ones((2, 1))) for env in (once, thrice))
-    assert found[1].tolist() == [1.0, 1.0]
-    assert found[2].all()
-    for theirs, ours in zip(expected[4]["final_obs"], found[4]["final_obs"], strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
-
-
-def test_a_file_that_a_users_task_lacks_is_not_blamed_on_the_robots():
-    def make(**kwargs):
-        raise FileNotFoundError(2, "No such file", "my_robot.xml")
-
-    dm_control_suite.register_environment("NoFile", make, cartpole.default_config)
-    with pytest.raises(FileNotFoundError, match=r"my_robot\.xml"):
-        PlaygroundEnv("NoFile")
-
-
-def test_bad_input_is_refused(cartpoles):
+def test_bad_input_is_refused(cartpoles: PlaygroundVectorEnv) -> None:
     with pytest.raises(ValueError, match=r"actions of shape \(4, 1\), not \(4,\)"):
         cartpoles.step(np.zeros(N_ENVS))
     with pytest.raises(ValueError, match="takes no options"):
@@ -353,59 +271,6 @@ def test_bad_input_is_refused(cartpoles):
         PlaygroundVectorEnv(CARTPOLE, 2).step(np.zeros((2, 1)))
 
 
-@pytest.mark.skipif(MENAGERIE_PATH.exists(), reason="mujoco_menagerie is there")
-def test_robots_that_cannot_be_fetched_are_named_in_one_sentence(monkeypatch):
-    monkeypatch.setenv("PATH", "")  # so that there is no git
-    with pytest.raises(gym.error.DependencyNotInstalled, match="needs the robots of mujoco_menag"):
-        PlaygroundEnv("Go1JoystickFlatTerrain")
-
-
-def test_an_old_version_is_named_in_one_sentence(monkeypatch):
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.0.5")
-    with pytest.raises(
-        gym.error.DependencyNotInstalled, match=r"playground 0\.2 or newer.*0\.0\.5"
-    ):
-        PlaygroundEnv(CARTPOLE)
-
-
-def test_every_other_task_is_registered():
-    assert {f"Playground/{task}-v0" for task in STOCK_TASKS} <= set(gym.registry)
-    assert gym.make("Playground/PendulumSwingup-v0").observation_space.shape == (3,)
-
-
-def test_a_task_that_was_added_is_registered_on_request():
-    def make(**kwargs):
-        return cartpole.Balance(swing_up=False, sparse=False, **kwargs)
-
-    dm_control_suite.register_environment("Added", make, cartpole.default_config)
-    for _ in range(2):
-        ensure_registered("Playground/Added-v0")
-    assert gym.make("Playground/Added-v0").observation_space.shape == (5,)
-
-
-class TwoSenses(cartpole.Balance):
-    """A task as a user may add it: what it observes is a dictionary."""
-
-    def _get_obs(self, data, info):
-        everything = super()._get_obs(data, info)
-        return {"state": everything[:3], "velocity": everything[3:]}
-
-
-def test_a_task_of_the_users_own_with_several_observations():
-    def make(**kwargs):
-        return TwoSenses(swing_up=False, sparse=False, **kwargs)
-
-    dm_control_suite.register_environment("TwoSenses", make, cartpole.default_config)
-    env = PlaygroundVecEnv("TwoSenses", 2, seed=0, max_episode_steps=3)
-    assert set(env.observation_space.spaces) == {"state", "velocity"}
-    first = env.reset()
-    assert (first["state"].shape, first["velocity"].shape) == ((2, 3), (2, 2))
-    *_, infos = [env.step(np.zeros((2, 1))) for _ in range(3)][-1]
-    assert infos[1]["terminal_observation"]["state"].shape == (3,)
-    model = sb3_policyflow.PolicyFlow("MultiInputPolicy", env, n_steps=4, batch_size=8, n_epochs=1)
-    assert model.learn(16).num_timesteps == 16
-
-
 DRAW = """
 import gymnasium as gym, numpy as np, sb3_policyflow
 env = gym.make("Playground/CartpoleBalance-v0", render_mode="rgb_array")
@@ -420,7 +285,7 @@ assert (frame != first).mean() > 0.001
 
 
 @pytest.mark.parametrize("backend", ["egl", "glfw"])
-def test_pictures_or_one_sentence(backend):
+def test_pictures_or_one_sentence(backend: str) -> None:
     """Without a display, which glfw needs and egl does not."""
     variables = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
     done = subprocess.run(

@@ -1,49 +1,101 @@
-"""What registers environments, and what is said where packages are missing or broken."""
+"""What registers environments, and the errors where packages are missing or broken."""
 
+import re
 import subprocess
 import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import pytest
+from gymnasium.error import DependencyNotInstalled
 
 import sb3_policyflow.envs
+from sb3_policyflow.envs import ensure_registered
+from sb3_policyflow.envs.extras import install_command
+
+TASK = "Playground/CheetahRun-v0"
 
 
-def run(code, **options):
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+def test_registering_twice_is_silent() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sb3_policyflow.envs.register()
 
 
-def test_ids_are_known_without_the_simulator():
-    done = run(
-        "import sys, gymnasium as gym, sb3_policyflow\n"
-        "from sb3_policyflow.envs.task_names import *\n"
-        "for task in PLAYGROUND_TASKS + OTHER_PLAYGROUND_TASKS:\n"
-        "    assert gym.spec(f'Playground/{task}-v0').vector_entry_point is not None\n"
-        "import sb3_policyflow.envs.playground\n"
-        "assert not {'jax', 'mujoco', 'mujoco_playground'} & set(sys.modules)"
-    )
-    assert done.returncode == 0, done.stderr
+@pytest.mark.slow
+def test_registering_imports_neither_torch_nor_mujoco() -> None:
+    code = """
+import importlib.util, sys, gymnasium
+# The package without what it imports itself.
+spec = importlib.util.find_spec("sb3_policyflow")
+sys.modules["sb3_policyflow"] = importlib.util.module_from_spec(spec)
+import sb3_policyflow.envs as envs
+envs.register()
+assert "MultiGoal-v0" in gymnasium.registry
+assert not {"torch", "mujoco", "matplotlib"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.slow
+def test_tasks_are_registered_without_the_simulator() -> None:
+    code = """
+import sys, gymnasium as gym, sb3_policyflow
+from sb3_policyflow.envs.task_names import *
+for task in PLAYGROUND_TASKS + OTHER_PLAYGROUND_TASKS:
+    assert gym.spec(f"Playground/{task}-v0").vector_entry_point is not None
+import sb3_policyflow.envs.playground
+assert not {"jax", "mujoco", "mujoco_playground"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_paper_has_ten_tasks() -> None:
     assert len(sb3_policyflow.envs.PLAYGROUND_TASKS) == 10
 
 
+def make_four(env_id: str) -> Any:
+    return gym.make_vec(env_id, 4)
+
+
 @pytest.mark.parametrize(
-    "make",
+    ("make", "env_id", "module", "extra"),
     [
-        "gym.make('Playground/CheetahRun-v0')",
-        "gym.make_vec('Playground/CheetahRun-v0', 4)",
-        "gym.make('Playground/HopperHop-v0')",
-        "ensure_registered('Playground/MyTask-v0')",
+        (gym.make, TASK, "mujoco_playground", "playground"),
+        (make_four, TASK, "mujoco_playground", "playground"),
+        (gym.make, "Playground/HopperHop-v0", "mujoco_playground", "playground"),
+        (ensure_registered, "Playground/MyTask-v0", "mujoco_playground", "playground"),
+        (gym.make, "PointMazeMultiGoal-Medium-v0", "gymnasium_robotics", "robotics"),
+        (ensure_registered, "PointMaze_Open-v9", "gymnasium_robotics", "robotics"),
     ],
 )
-def test_a_missing_extra_is_named_in_one_sentence(make):
-    done = run(
-        "import sys; sys.modules['mujoco_playground'] = None\n"
-        "import gymnasium as gym\n"
-        "from sb3_policyflow.envs import ensure_registered\n" + make
-    )
-    last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith("gymnasium.error.DependencyNotInstalled: Playground/")
-    assert last.endswith("pip install 'sb3-policyflow[playground]'")
+def test_a_missing_extra_is_named_in_one_sentence(
+    make: Callable[[str], Any],
+    env_id: str,
+    module: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    sentence = re.escape(f"{env_id} needs {module}: {install_command(extra)}")
+    with pytest.raises(DependencyNotInstalled, match=f"^{sentence}$"):
+        make(env_id)
+
+
+def test_the_command_is_for_a_checkout() -> None:
+    assert 'pip install ".[robotics]"` in the checkout' in install_command("robotics")
+    assert '--upgrade-strategy eager ".[onnx]"`' in install_command("onnx", upgrade=True)
+
+
+@pytest.fixture
+def broken_playground(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module in place of MuJoCo Playground's, whose source is to be written."""
+    monkeypatch.delitem(sys.modules, "mujoco_playground", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path / "mujoco_playground.py"
 
 
 @pytest.mark.parametrize(
@@ -54,30 +106,21 @@ def test_a_missing_extra_is_named_in_one_sentence(make):
         "raise ImportError('not_there\\nand how to\\nmend it')",
     ],
 )
-def test_a_broken_package_is_told_from_a_missing_one(fault, tmp_path):
-    (tmp_path / "mujoco_playground.py").write_text(fault)
-    done = run(
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "import gymnasium as gym, sb3_policyflow\n"
-        "gym.make('Playground/CheetahRun-v0')",
-        cwd=tmp_path,
-    )
-    last = done.stderr.strip().splitlines()[-1]
-    assert "which does not go with the packages installed here" in last
-    assert "not_there" in last
-    assert last.endswith("pip install 'sb3-policyflow[playground]' --upgrade")
+def test_a_broken_package_is_told_from_a_missing_one(fault: str, broken_playground: Path) -> None:
+    broken_playground.write_text(fault)
+    with pytest.raises(DependencyNotInstalled) as caught:
+        gym.make(TASK)
+    message = str(caught.value)
+    assert "which does not work with the packages installed here" in message
+    assert "not_there" in message
+    assert message.endswith(install_command("playground", upgrade=True))
+    assert "\n" not in message
 
 
-def test_an_old_version_is_named_before_it_is_imported(tmp_path):
-    (tmp_path / "mujoco_playground.py").write_text("import what_it_had_then")
-    (tmp_path / "playground-0.0.5.dist-info").mkdir()
-    metadata = "Metadata-Version: 2.1\nName: playground\nVersion: 0.0.5\n"
-    (tmp_path / "playground-0.0.5.dist-info" / "METADATA").write_text(metadata)
-    done = run(
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "import gymnasium as gym, sb3_policyflow\n"
-        "gym.make('Playground/CheetahRun-v0')",
-        cwd=tmp_path,
-    )
-    last = done.stderr.strip().splitlines()[-1]
-    assert "needs playground 0.2 or newer, and 0.0.5 is installed: pip install" in last
+def test_an_old_version_is_named_before_it_is_imported(broken_playground: Path) -> None:
+    broken_playground.write_text("import what_it_had_then")
+    metadata = broken_playground.parent / "playground-0.0.5.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text("Metadata-Version: 2.1\nName: playground\nVersion: 0.0.5\n")
+    with pytest.raises(DependencyNotInstalled, match=r"playground 0\.2 or newer, and 0\.0\.5 is"):
+        gym.make(TASK)

@@ -6,14 +6,15 @@ import pytest
 import torch as th
 
 from sb3_policyflow import FPO
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples, rows
-from sb3_policyflow.fpo.fpo import Probes
+from sb3_policyflow.common.tree import rows
+from sb3_policyflow.fpo.fpo import FPOUpdate, MonteCarloSamples
 from sb3_policyflow.fpo.policies import FPOPolicy
 
 
 def collected(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
-    """A model with a rollout in its buffer and the probes of its first epoch."""
+    """A model with a rollout in its buffer and what its first epoch draws."""
     model = FPO(
         "MlpPolicy",
         "Pendulum-v1",
@@ -26,14 +27,13 @@ def collected(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
     )
     model.learn(64)
     model.policy.set_training_mode(False)
-    rollout = model._rollout()
-    probes = model._draw_probes(rollout, model._behavior(rollout))
-    return model, rollout._replace(probes=probes)
+    rollout = model.rollout_buffer.samples()
+    return model, rollout._replace(drawn=FPOUpdate(model, rollout).draw(rollout))
 
 
 def log_ratio(model: FPO, batch: FlowRolloutBufferSamples) -> th.Tensor:
     features = model.policy.actor_features(batch.observations)
-    return model._policy_terms(batch, features, batch.probes).log_ratio
+    return FPOUpdate(model, batch).terms(batch, features).log_ratio
 
 
 def perturb(model: FPO, scale: float = 0.05) -> None:
@@ -42,13 +42,13 @@ def perturb(model: FPO, scale: float = 0.05) -> None:
             parameter += scale * th.randn_like(parameter)
 
 
-@pytest.mark.parametrize("probe_average", ["loss", "objective"])
+@pytest.mark.parametrize("mc_average", ["loss", "objective"])
 @pytest.mark.parametrize("loss_target", ["epsilon", "velocity"])
-def test_ratio_is_one_at_equal_weights(probe_average: str, loss_target: str) -> None:
-    model, rollout = collected(probe_average=probe_average, loss_target=loss_target)
+def test_ratio_is_one_at_equal_weights(mc_average: str, loss_target: str) -> None:
+    model, rollout = collected(mc_average=mc_average, loss_target=loss_target)
     for batch in model.rollout_buffer.minibatches(rollout, 16):
         ratio = log_ratio(model, batch).exp()
-        assert ratio.shape == ((16,) if probe_average == "loss" else (16, 8))
+        assert ratio.shape == ((16,) if mc_average == "loss" else (16, 8))
         # The same numbers up to rounding, which depends on the size of a batch.
         th.testing.assert_close(ratio, th.ones_like(ratio), atol=1e-5, rtol=0)
 
@@ -68,39 +68,39 @@ def test_ratio_by_hand() -> None:
     """a = 3, eps = 1, t = 1/2: x_t = 2 and the target is 2; a velocity of 5 is wrong by 3."""
     losses = {"velocity": 9.0, "epsilon": 0.25 * 9.0}
     for target, expected in losses.items():
-        model, rollout = collected(loss_target=target, n_probes=1)
+        model, rollout = collected(loss_target=target, n_mc_samples=1)
         with th.no_grad():
             model.policy.velocity.output.weight.zero_()
             model.policy.velocity.output.bias.fill_(5.0)
-        probes = Probes(th.full((64, 1), 0.5), th.ones(64, 1, 1), th.full((64, 1), 10.0))
-        batch = rollout._replace(actions=th.full((64, 1), 3.0), probes=probes)
+        drawn = MonteCarloSamples(th.full((64, 1), 0.5), th.ones(64, 1, 1), th.full((64, 1), 10.0))
+        batch = rollout._replace(actions=th.full((64, 1), 3.0), drawn=drawn)
         th.testing.assert_close(log_ratio(model, batch), th.full((64,), 10.0 - expected))
 
 
 def test_epsilon_is_the_noise_that_the_velocity_stands_for() -> None:
     """FPO's time is 1 - t and its velocity u = -v: its eps-hat is x + (1 - tau) u = x - t v."""
-    model, rollout = collected(loss_target="epsilon", n_probes=3)
-    probes: Probes = rollout.probes
-    times, noises = probes.times.unsqueeze(-1), probes.noises
+    model, rollout = collected(loss_target="epsilon", n_mc_samples=3)
+    drawn: MonteCarloSamples = rollout.drawn
+    times, noises = drawn.times.unsqueeze(-1), drawn.noises
     points = (1 - times) * noises + times * rollout.actions.unsqueeze(1)
     with th.no_grad():
         features = model.policy.actor_features(rollout.observations)
-        velocity = model.policy.velocity(points, probes.times, features.unsqueeze(1))
+        velocity = model.policy.velocity(points, drawn.times, features.unsqueeze(1))
     predicted = points - times * velocity
     expected = (noises - predicted).square().mean(-1)
-    th.testing.assert_close(probes.losses, expected, atol=1e-5, rtol=1e-4)
+    th.testing.assert_close(drawn.reference_losses, expected, atol=1e-5, rtol=1e-4)
 
 
-def test_probes_lie_where_steps_start() -> None:
-    _, rollout = collected(n_flow_steps=4, n_probes=50)
-    assert sorted(set(rollout.probes.times.flatten().tolist())) == [0.0, 0.25, 0.5, 0.75]
-    _, rollout = collected(n_flow_steps=4, n_probes=50, time_sampler="uniform")
-    assert len(set(rollout.probes.times.flatten().tolist())) > 1000
+def test_times_are_where_steps_start() -> None:
+    _, rollout = collected(n_flow_steps=4, n_mc_samples=50)
+    assert sorted(set(rollout.drawn.times.flatten().tolist())) == [0.0, 0.25, 0.5, 0.75]
+    _, rollout = collected(n_flow_steps=4, n_mc_samples=50, time_sampler="uniform")
+    assert len(set(rollout.drawn.times.flatten().tolist())) > 1000
 
 
 def test_losses_and_differences_are_clamped() -> None:
-    model, rollout = collected(loss_clamp=0.5, difference_clamp=0.25, probe_average="objective")
-    assert rollout.probes.losses.max().item() == 0.5
+    model, rollout = collected(loss_clamp=0.5, difference_clamp=0.25, mc_average="objective")
+    assert rollout.drawn.reference_losses.max().item() == 0.5
     perturb(model, 1.0)
     assert log_ratio(model, rollout).abs().max().item() == 0.25
 

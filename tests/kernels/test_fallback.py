@@ -12,7 +12,7 @@ import torch as th
 from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.on_policy_algorithm import FlowOnPolicyAlgorithm
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.flows import integrate
 from sb3_policyflow.kernels.compiler import note_fallback
 from sb3_policyflow.kernels.fields import KernelVelocityField

@@ -4,17 +4,24 @@ from typing import Any
 
 import pytest
 import torch as th
-from sb3_policyflow.policyflow.behavior import Behavior
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import clipped_surrogate
-from sb3_policyflow.common.type_aliases import FlowRolloutBufferSamples
 from sb3_policyflow.policyflow.policies import PolicyFlowRecord
-from sb3_policyflow.policyflow.policyflow import Probes
+from sb3_policyflow.policyflow.policyflow import PathSamples, PolicyFlowUpdate
 
 N_SAMPLES = 16
+
+
+class DoubleExtractor(FlattenExtractor):
+    """SB3 makes observations single precision, whatever the precision of the policy."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations).double()
 
 
 def tiny_model(**options: Any) -> PolicyFlow:
@@ -24,6 +31,7 @@ def tiny_model(**options: Any) -> PolicyFlow:
         "embedding_dim": 4,
         "initialization": "glorot",
         "activation_fn": nn.SiLU,
+        "features_extractor_class": DoubleExtractor,
         **options.pop("policy_kwargs", {}),
     }
     model = PolicyFlow(
@@ -36,25 +44,27 @@ def tiny_model(**options: Any) -> PolicyFlow:
         **options,
     )
     model.policy.double()
-    model._setup_schedules()
     return model
 
 
-def sample_batch(model: PolicyFlow) -> tuple[FlowRolloutBufferSamples, th.Tensor, Behavior]:
-    """A batch sampled from the model's policy, its features and the behavior."""
-    features = th.randn(N_SAMPLES, 3, dtype=th.float64)
+def sample_batch(
+    model: PolicyFlow,
+) -> tuple[FlowRolloutBufferSamples, th.Tensor, PolicyFlowUpdate]:
+    """A batch sampled from the model's policy, its features and its update."""
+    observations = th.randn(N_SAMPLES, 3)
+    features = model.policy.actor_features(observations)
     with th.no_grad():
         actions, record = model.policy.sample_actions(features)
     batch = FlowRolloutBufferSamples(
-        observations=features,
+        observations=observations,
         actions=actions,
         old_values=th.zeros(N_SAMPLES, dtype=th.float64),
         advantages=th.randn(N_SAMPLES, dtype=th.float64),
         returns=th.randn(N_SAMPLES, dtype=th.float64),
         record=record,
     )
-    behavior = Behavior(model.policy, features)
-    return batch._replace(probes=model._draw_probes(batch, behavior)), features, behavior
+    update = PolicyFlowUpdate(model, batch)
+    return batch._replace(drawn=update.draw(batch)), features, update
 
 
 def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
@@ -63,12 +73,12 @@ def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
             parameter += scale * th.randn_like(parameter)
 
 
-@pytest.mark.parametrize("path", ["rectified", "stochastic", "trigflow"])
+@pytest.mark.parametrize("interpolant", ["rectified", "stochastic", "trigflow"])
 @pytest.mark.parametrize("n_times", [1, 3])
-def test_nothing_has_changed_before_the_first_step(path: str, n_times: int) -> None:
-    model = tiny_model(path=path, n_times=n_times)
-    batch, features, behavior = sample_batch(model)
-    terms = model._policy_terms(batch, features, behavior)
+def test_nothing_has_changed_before_the_first_step(interpolant: str, n_times: int) -> None:
+    model = tiny_model(interpolant=interpolant, n_times=n_times)
+    batch, features, update = sample_batch(model)
+    terms = update.terms(batch, features)
     assert th.equal(terms.log_ratio, th.zeros(N_SAMPLES, n_times, dtype=th.float64))
     assert terms.kl.item() == 0.0
     assert terms.metrics["velocity_change"].item() == 0.0
@@ -76,33 +86,35 @@ def test_nothing_has_changed_before_the_first_step(path: str, n_times: int) -> N
 
 def test_ratio_is_that_of_the_shifted_gaussian() -> None:
     model = tiny_model()
-    batch, features, behavior = sample_batch(model)
+    batch, features, update = sample_batch(model)
     perturb(model)
-    terms = model._policy_terms(batch, features, behavior)
-    probes: Probes = batch.probes
+    terms = update.terms(batch, features)
+    drawn: PathSamples = batch.drawn
     with th.no_grad():
-        new_velocity = model.policy.velocity(probes.points[:, 0], probes.times[:, 0], features)
-        change = new_velocity - probes.old_velocity[:, 0]
+        new_velocity = model.policy.velocity(drawn.points[:, 0], drawn.times[:, 0], features)
+        change = new_velocity - drawn.reference_velocity[:, 0]
         noise = batch.actions - batch.record.endpoints
         new = Independent(Normal(change, model.policy.log_std.exp()), 1).log_prob(noise)
-        old = Independent(Normal(th.zeros_like(noise), behavior.log_std.exp()), 1).log_prob(noise)
+        old = Independent(Normal(th.zeros_like(noise), update.reference_log_std.exp()), 1).log_prob(
+            noise
+        )
     th.testing.assert_close(terms.log_ratio[:, 0], new - old)
     assert terms.log_ratio.abs().min() > 0
 
 
 def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
     """A velocity that grows by a constant moves the end point by (pi/2) times it, exactly."""
-    model = tiny_model(path="trigflow", time_average="shift", n_times=2, n_flow_steps=5)
-    batch, features, behavior = sample_batch(model)
+    model = tiny_model(interpolant="trigflow", time_average="shift", n_times=2, n_flow_steps=5)
+    batch, features, update = sample_batch(model)
     change = th.tensor([0.01], dtype=th.float64)
     with th.no_grad():
         model.policy.velocity.output.weight.zero_()
-        before = model.policy.carry(batch.record.latents, features)
-        behavior = Behavior(model.policy, features)
-        probes = model._draw_probes(batch, behavior)
+        before = model.policy.transport(batch.record.latents, features)
+        update = PolicyFlowUpdate(model, batch)
+        batch = batch._replace(drawn=update.draw(batch))
         model.policy.velocity.output.bias += change
-        true_shift = model.policy.carry(batch.record.latents, features) - before
-    terms = model._policy_terms(batch._replace(probes=probes), features, behavior)
+        true_shift = model.policy.transport(batch.record.latents, features) - before
+    terms = update.terms(batch, features)
     noise = batch.actions - batch.record.endpoints
     log_std = model.policy.log_std
     new = Independent(Normal(true_shift, log_std.exp()), 1).log_prob(noise)
@@ -110,20 +122,20 @@ def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
     th.testing.assert_close(terms.log_ratio[:, 0], new - old)
 
 
-def test_equals_gaussian_ppo_when_the_old_velocity_and_the_latents_are_zero() -> None:
-    """With z = phi = 0 and v_old = 0 the new velocity is the mean of PPO's Gaussian."""
+def test_equals_gaussian_ppo_when_the_reference_velocity_and_the_latents_are_zero() -> None:
+    """With z = phi = 0 and v_ref = 0 the new velocity is the mean of PPO's Gaussian."""
     model = tiny_model(policy_kwargs={"initialization": "glorot_zero_output"}, ent_coef=0.01)
-    batch, features, behavior = sample_batch(model)
+    batch, features, update = sample_batch(model)
     zeros = th.zeros_like(batch.actions)
     batch = batch._replace(record=PolicyFlowRecord(zeros, zeros), actions=th.randn_like(zeros))
-    batch = batch._replace(probes=model._draw_probes(batch, behavior))
+    batch = batch._replace(drawn=update.draw(batch))
     perturb(model)
     advantages, parameters = batch.advantages, actor_parameters(model)
 
-    terms = model._policy_terms(batch, features, behavior)
+    terms = update.terms(batch, features)
     ours = -clipped_surrogate(terms.log_ratio[:, 0], advantages, 0.2).mean() + terms.regularizer
 
-    means = model.policy.velocity(zeros, batch.probes.times[:, 0], features)
+    means = model.policy.velocity(zeros, batch.drawn.times[:, 0], features)
     gaussian = Independent(Normal(means, model.policy.log_std.exp()), 1)
     standard = Independent(Normal(zeros, th.ones_like(zeros)), 1)
     ratio = (gaussian.log_prob(batch.actions) - standard.log_prob(batch.actions)).exp()
@@ -141,14 +153,14 @@ def actor_parameters(model: PolicyFlow) -> list[nn.Parameter]:
     return [*model.policy.velocity.parameters(), model.policy.log_std]
 
 
-@pytest.mark.parametrize("path", ["rectified", "stochastic", "trigflow"])
-def test_gradient_equals_finite_differences_for_every_parameter(path: str) -> None:
-    model = tiny_model(path=path, brownian_coef=0.25, ent_coef=0.01, n_times=2)
-    batch, features, behavior = sample_batch(model)
+@pytest.mark.parametrize("interpolant", ["rectified", "stochastic", "trigflow"])
+def test_gradient_equals_finite_differences_for_every_parameter(interpolant: str) -> None:
+    model = tiny_model(interpolant=interpolant, brownian_coef=0.25, ent_coef=0.01, n_times=2)
+    batch, features, update = sample_batch(model)
     perturb(model, 0.02)
 
     def loss() -> th.Tensor:
-        terms = model._policy_terms(batch, features, behavior)
+        terms = update.terms(batch, features)
         objective = clipped_surrogate(terms.log_ratio, batch.advantages.unsqueeze(1), 0.2)
         return -objective.mean() + terms.regularizer
 
@@ -173,39 +185,36 @@ def finite_differences(loss: Any, parameter: th.Tensor, step: float = 1e-6) -> t
     return slopes
 
 
+BY_HAND = PathSamples(
+    times=th.tensor([[0.5]]),
+    points=th.tensor([[[3.0, 1.0]]]),
+    reference_velocity=th.tensor([[[2.0, 0.0]]]),
+)
+
+
 def test_brownian_loss_by_hand() -> None:
-    """Straight path at t = 1/2 with x = (3, 1), v_old = (2, 0), v = (4, 2): eta = (0, 0)."""
-    model = tiny_model()
-    probes = Probes(
-        times=th.tensor([[0.5]]),
-        points=th.tensor([[[3.0, 1.0]]]),
-        old_velocity=th.tensor([[[2.0, 0.0]]]),
-    )
-    assert model._brownian_loss(probes, th.tensor([[[4.0, 2.0]]])).item() == 0.0
+    """Straight path at t = 1/2 with x = (3, 1), v_ref = (2, 0), v = (4, 2): eta = (0, 0)."""
+    _, _, update = sample_batch(tiny_model())
+    assert update.brownian_loss(BY_HAND, th.tensor([[[4.0, 2.0]]])).item() == 0.0
     # v = (8, 2): eta = (2, 0); the squared norm is 4, its mean over dimensions 2.
-    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 4.0
-    model.brownian_reduction = "mean"
-    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 2.0
+    assert update.brownian_loss(BY_HAND, th.tensor([[[8.0, 2.0]]])).item() == 4.0
+    _, _, update = sample_batch(tiny_model(brownian_reduction="mean"))
+    assert update.brownian_loss(BY_HAND, th.tensor([[[8.0, 2.0]]])).item() == 2.0
 
 
 def test_brownian_loss_by_hand_with_narrower_latents() -> None:
-    """With s = 1/2: eta = v / 2 - 4 (x - v_old / 2) = (4, 1) - 4 (2, 1) = (-4, -3)."""
-    model = tiny_model(policy_kwargs={"latent_std": 0.5})
-    probes = Probes(
-        times=th.tensor([[0.5]]),
-        points=th.tensor([[[3.0, 1.0]]]),
-        old_velocity=th.tensor([[[2.0, 0.0]]]),
-    )
-    assert model._brownian_loss(probes, th.tensor([[[8.0, 2.0]]])).item() == 25.0
+    """With s = 1/2: eta = v / 2 - 4 (x - v_ref / 2) = (4, 1) - 4 (2, 1) = (-4, -3)."""
+    _, _, update = sample_batch(tiny_model(latent_std=0.5))
+    assert update.brownian_loss(BY_HAND, th.tensor([[[8.0, 2.0]]])).item() == 25.0
 
 
 def test_latents_have_their_standard_deviation() -> None:
-    policy = tiny_model(policy_kwargs={"latent_std": 0.2}).policy
+    policy = tiny_model(latent_std=0.2).policy
     features = th.zeros(20_000, 3, dtype=th.float64)
     with th.no_grad():
         _, record = policy.sample_actions(features)
         assert record.latents.std().item() == pytest.approx(0.2, rel=0.03)
-        th.testing.assert_close(record.endpoints, policy.carry(record.latents, features))
+        th.testing.assert_close(record.endpoints, policy.transport(record.latents, features))
         _, record = policy.sample_actions(features, deterministic=True)
     assert not record.latents.any()
 
@@ -219,9 +228,9 @@ def test_approximate_ratio_approaches_the_exact_one_for_small_updates() -> None:
         th.manual_seed(5)
         perturb(model, scale)
         with th.no_grad():
-            probes: Probes = batch.probes
-            new = model.policy.velocity(probes.points, probes.times, features.unsqueeze(1))
-            approximate = (new - probes.old_velocity).mean(1)
-            exact = model.policy.carry(batch.record.latents, features) - batch.record.endpoints
+            drawn: PathSamples = batch.drawn
+            new = model.policy.velocity(drawn.points, drawn.times, features.unsqueeze(1))
+            approximate = (new - drawn.reference_velocity).mean(1)
+            exact = model.policy.transport(batch.record.latents, features) - batch.record.endpoints
         errors.append((approximate - exact).norm().item())
     assert errors[1] < 0.7 * errors[0]

@@ -19,9 +19,7 @@ Where the paper is silent, this module assumes:
 - Success is to end within ``SUCCESS_RADIUS`` of a goal; the paper has no such number.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -33,16 +31,15 @@ from numpy.typing import NDArray
 from sb3_policyflow.envs.multigoal.point_masses import (
     MAX_ACTION,
     MAX_EPISODE_STEPS,
-    FloatArray,
-    Observation,
     PointMasses,
 )
-from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
+from sb3_policyflow.envs.type_aliases import Float32Array, FloatArray, Info
+from sb3_policyflow.envs.vector import GymVectorVecEnv, final_infos
 
 METADATA: Info = {"render_modes": ["rgb_array"], "render_fps": 15}
 
 
-def _spaces() -> tuple[gym.Space[Observation], gym.Space[Observation]]:
+def _spaces() -> tuple[gym.Space[Float32Array], gym.Space[Float32Array]]:
     """Observation and action space; new ones for each environment, as each has its own seed."""
     return (
         gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),
@@ -50,7 +47,7 @@ def _spaces() -> tuple[gym.Space[Observation], gym.Space[Observation]]:
     )
 
 
-class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
+class MultiGoalEnv(gym.Env[Float32Array, Float32Array]):
     """``MultiGoal-v0``, one environment.
 
     Observation ``[x, y, v_x, v_y]``, action ``[a_x, a_y]`` in ``[-5, 5]``. ``info["is_success"]``
@@ -60,8 +57,8 @@ class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
     The environment truncates itself. Under ``gymnasium.make``, whose time limit is a wrapper of the
     same length, an argument ``max_episode_steps`` can shorten an episode but not lengthen it.
 
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :param max_episode_steps: Steps after which an episode is truncated.
     """
 
     metadata = METADATA
@@ -75,12 +72,12 @@ class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[Observation, Info]:
+    ) -> tuple[Float32Array, Info]:
         super().reset(seed=seed)
         self.points.start(self.np_random, options)
         return self.points.observations()[0], self._info()
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
+    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, Info]:
         rewards, terminated, truncated = self.points.step(np.asarray(action)[None])
         observation = self.points.observations()[0]
         return (
@@ -99,7 +96,7 @@ class MultiGoalEnv(gym.Env[Observation, NDArray[np.float32]]):
 
 
 class MultiGoalState(NamedTuple):
-    """All that the future of a ``MultiGoalVectorEnv`` depends on, the actions apart."""
+    """All that the future of a ``MultiGoalVectorEnv`` depends on besides the actions."""
 
     states: FloatArray
     steps: NDArray[np.int64]
@@ -107,16 +104,16 @@ class MultiGoalState(NamedTuple):
     generator: Mapping[str, Any]
 
 
-class MultiGoalVectorEnv(gym.vector.VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+class MultiGoalVectorEnv(gym.vector.VectorEnv[Float32Array, Float32Array, NDArray[Any]]):
     """``MultiGoal-v0``, ``num_envs`` environments in one batch of arrays.
 
     Same-step autoreset: when an episode ends, the next one's first observation is returned, and
     ``infos["final_obs"]`` and ``infos["final_info"]["is_success"]`` hold the end of the one before.
     All environments draw from one random generator.
 
-    :param num_envs: number of environments
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated
+    :param num_envs: Number of environments.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :param max_episode_steps: Steps after which an episode is truncated.
     """
 
     def __init__(
@@ -135,19 +132,24 @@ class MultiGoalVectorEnv(gym.vector.VectorEnv[Observation, NDArray[np.float32], 
 
     def reset(
         self, *, seed: int | None = None, options: Info | None = None
-    ) -> tuple[Observation, Info]:
+    ) -> tuple[Float32Array, Info]:
         super().reset(seed=seed)
         self.points.start(self.np_random, options)
         return self.points.observations(), {}
 
     def step(
-        self, actions: NDArray[np.float32]
-    ) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], Info]:
+        self, actions: Float32Array
+    ) -> tuple[Float32Array, NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         rewards, terminated, truncated = self.points.step(actions)
-        infos: Info = {}
         done = terminated | truncated
+        infos: Info = {}
         if done.any():
-            infos = self._final_infos(done)
+            is_success = self.points.is_success() & done
+            infos = {
+                **final_infos(self.points.observations(), done),
+                "final_info": {"is_success": is_success, "_is_success": done},
+                "_final_info": done,
+            }
             self.points.reset(np.flatnonzero(done), self.np_random)
         return self.points.observations(), rewards, terminated, truncated, infos
 
@@ -173,19 +175,6 @@ class MultiGoalVectorEnv(gym.vector.VectorEnv[Observation, NDArray[np.float32], 
         self.points.trails[:] = state.trails
         self.np_random.bit_generator.state = state.generator
 
-    def _final_infos(self, done: NDArray[np.bool_]) -> Info:
-        final_obs = np.full(self.num_envs, None, dtype=object)
-        observations = self.points.observations()
-        for i in np.flatnonzero(done).tolist():
-            final_obs[i] = observations[i]
-        final_info = {"is_success": self.points.is_success() & done, "_is_success": done}
-        return {
-            "final_obs": final_obs,
-            "_final_obs": done,
-            "final_info": final_info,
-            "_final_info": done,
-        }
-
 
 class MultiGoalVecEnv(GymVectorVecEnv):
     """``MultiGoal-v0`` as an SB3 ``VecEnv``: thousands of environments in one process.
@@ -194,10 +183,10 @@ class MultiGoalVecEnv(GymVectorVecEnv):
     ``MultiGoalEnv``: one dictionary for all environments, where a value may also have one row for
     each, or a list with one dictionary for each.
 
-    :param num_envs: number of environments
-    :param seed: seed of the first ``reset``; ``seed()`` sets another
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated
+    :param num_envs: Number of environments.
+    :param seed: Seed of the first ``reset``; ``seed()`` sets another.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :param max_episode_steps: Steps after which an episode is truncated.
     """
 
     env: MultiGoalVectorEnv
@@ -209,22 +198,25 @@ class MultiGoalVecEnv(GymVectorVecEnv):
         render_mode: str | None = None,
         max_episode_steps: int = MAX_EPISODE_STEPS,
     ) -> None:
-        super().__init__(MultiGoalVectorEnv(num_envs, render_mode, max_episode_steps))
+        env = MultiGoalVectorEnv(num_envs, render_mode, max_episode_steps)
+        super().__init__(env, batch_options=_stack_options)
         self.seed(seed)
 
     def get_state(self) -> MultiGoalState:
-        """All that the future depends on, the actions apart: points, counters, generator."""
+        """All that the future depends on besides the actions: points, counters, generator."""
         return self.env.get_state()
 
     def set_state(self, state: MultiGoalState) -> None:
         """Continue from what ``get_state`` returned, instead of ``reset``."""
         self.env.set_state(state)
 
-    def _batch_options(self, options: Any) -> Info:
-        keys = set(options[0])
-        if any(set(row) != keys for row in options):
-            raise ValueError(
-                "A list of reset options must have the same keys for all environments, not "
-                f"{[sorted(row) for row in options]}."
-            )
-        return {key: np.stack([row[key] for row in options]) for key in keys}
+
+def _stack_options(options: Sequence[Info]) -> Info:
+    """One dictionary of reset options, with a row for each environment."""
+    keys = set(options[0])
+    if any(set(each) != keys for each in options):
+        raise ValueError(
+            "A list of reset options must have the same keys for all environments, not "
+            f"{[sorted(each) for each in options]}."
+        )
+    return {key: np.stack([each[key] for each in options]) for key in keys}

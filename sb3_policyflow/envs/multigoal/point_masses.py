@@ -3,8 +3,6 @@
 What is assumed where the paper is silent is listed in ``sb3_policyflow.envs.multigoal``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_policyflow.envs.drawing import draw_multigoal
-
-FloatArray = NDArray[np.float64]
-Observation = NDArray[np.float32]
+from sb3_policyflow.envs.type_aliases import Float32Array, FloatArray
 
 DT = 0.1
 MAX_EPISODE_STEPS = 50
@@ -32,8 +28,8 @@ def nearest_goal(positions: FloatArray) -> tuple[NDArray[np.int_], FloatArray]:
 
     As all goals are equally far from the center, it is the one with the largest ``p . g``.
 
-    :param positions: shape ``(n, 2)``
-    :return: two arrays of shape ``(n,)``
+    :param positions: Shape (n, 2).
+    :return: Two arrays of shape (n,).
     """
     nearest = (positions @ GOALS.T).argmax(axis=1)
     offset = positions - GOALS[nearest]
@@ -46,7 +42,7 @@ def _squared_norm(vectors: FloatArray) -> FloatArray:
 
 
 class Step(NamedTuple):
-    """What one step of the batch yields, each of shape ``(num_envs,)``."""
+    """What one step of the batch returns, each of shape (num_envs,)."""
 
     rewards: FloatArray
     terminated: NDArray[np.bool_]
@@ -60,9 +56,10 @@ class PointMasses:
     ``dt (exp(-0.3 d^2) + exp(-0.1 d^2) - 0.01 |a|^2)`` with ``d`` the distance from ``p'`` to the
     nearest goal.
 
-    :param num_envs: number of points
-    :param max_episode_steps: steps after which an episode is truncated
-    :param keep_trails: keep each episode's positions, for a picture
+    :param num_envs: Number of points.
+    :param max_episode_steps: Steps after which an episode is truncated.
+    :param keep_trails: Whether to keep each episode's positions, for a picture.
+    :raises ValueError: If a number is less than 1.
     """
 
     def __init__(self, num_envs: int, max_episode_steps: int, keep_trails: bool) -> None:
@@ -79,16 +76,16 @@ class PointMasses:
 
     @property
     def positions(self) -> FloatArray:
-        """A view on the states, shape ``(num_envs, 2)``."""
+        """A view on the states, shape (num_envs, 2)."""
         return self.states[:, :2]
 
     @property
     def velocities(self) -> FloatArray:
-        """A view on the states, shape ``(num_envs, 2)``."""
+        """A view on the states, shape (num_envs, 2)."""
         return self.states[:, 2:]
 
-    def observations(self) -> Observation:
-        """``[x, y, v_x, v_y]`` of each point, shape ``(num_envs, 4)``; a copy."""
+    def observations(self) -> Float32Array:
+        """``[x, y, v_x, v_y]`` of each point, shape (num_envs, 4); a copy."""
         return self.states.astype(np.float32)
 
     def reset(self, which: NDArray[np.int_], rng: np.random.Generator) -> None:
@@ -101,8 +98,8 @@ class PointMasses:
     def start(self, rng: np.random.Generator, options: Mapping[str, ArrayLike] | None) -> None:
         """Begin an episode with each point, from random states or from those in ``options``.
 
-        :param options: ``position`` and ``velocity``, of shape ``(2,)`` or ``(num_envs, 2)``
-        :raises ValueError: for another key or shape, or a position outside the workspace
+        :param options: ``position`` and ``velocity``, of shape (2,) or (num_envs, 2).
+        :raises ValueError: For another key or shape, or a position outside the workspace.
         """
         options = options or {}
         if unknown := sorted(set(options) - {"position", "velocity"}):
@@ -118,7 +115,7 @@ class PointMasses:
         self._extend_trails()
 
     def step(self, actions: ArrayLike) -> Step:
-        """Advance all points by one step under ``actions``, shape ``(num_envs, 2)``."""
+        """Advance all points by one step under ``actions``, shape (num_envs, 2)."""
         actions = np.asarray(actions, dtype=np.float64)
         self.positions[:] += self.velocities * DT
         self.velocities[:] += actions.clip(-MAX_ACTION, MAX_ACTION) * DT

@@ -1,10 +1,8 @@
 """Environments of MuJoCo Playground in one batch of JAX arrays.
 
-This module imports JAX; ``sb3_policyflow.envs.playground``, which has the environments, does not
-before one of them is made.
+This module imports JAX. ``sb3_policyflow.envs.playground``, which has the environments, imports it
+when one of them is made.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
@@ -34,7 +32,9 @@ def task_config(task: str, overrides: Overrides) -> Any:
 
     Playground's default there, MuJoCo Warp, is slower on a CPU by a factor of five or more.
 
-    :raises ValueError: if a key is not in the configuration
+    :param task: Name of the task.
+    :param overrides: Changes to the configuration, nested or with dots in their keys.
+    :raises ValueError: If a key is not in the configuration.
     """
     config = registry.get_default_config(task)
     if "impl" in config and jax.default_backend() == "cpu":
@@ -62,9 +62,9 @@ def _flatten(overrides: Overrides) -> dict[str, Any]:
 
 
 def _require_setting(task: str, known: Any, key: str) -> None:
-    """See whether a key with dots is in nested settings: the engine would add it, and not use it.
+    """Check that a key with dots is in nested settings: the engine would add it, and ignore it.
 
-    :raises ValueError: if it is not, with the names that are there
+    :raises ValueError: If it is not, with the names of the settings.
     """
     parts = key.split(".")
     for depth, part in enumerate(parts):
@@ -80,15 +80,15 @@ def _require_setting(task: str, known: Any, key: str) -> None:
 class PlaygroundBatch:
     """``num_envs`` environments of one task, stepped by one compiled function.
 
-    Arrays are JAX's and stay on its device; only the flags of ended episodes come to the host.
-    Nothing is reset unless asked for. A broken simulation (Playground ends an episode when a number
-    in it is not one) has a reward of 0.
+    Arrays are JAX's and stay on its device; only the flags of ended episodes come to the host. An
+    environment is reset by ``reset`` and ``renew`` only. A broken simulation, whose episode
+    Playground ends because a value has become NaN, has a reward of 0.
 
-    :param task: name of the task
-    :param num_envs: number of environments
-    :param max_episode_steps: time limit; None for the task's ``episode_length``
-    :param overrides: changes to the task's configuration
-    :raises ValueError: if a number is less than 1, or an override is not known
+    :param task: Name of the task.
+    :param num_envs: Number of environments.
+    :param max_episode_steps: Time limit; None for the task's ``episode_length``.
+    :param overrides: Changes to the task's configuration.
+    :raises ValueError: If a number is less than 1, or an override is not known.
     """
 
     def __init__(
@@ -116,49 +116,49 @@ class PlaygroundBatch:
     def state(self) -> Tree:
         """Playground's own state; ``obs`` and ``reward`` are those of the last step.
 
-        :raises ResetNeeded: before the first ``reset``
+        :raises ResetNeeded: Before the first ``reset``.
         """
         if self._state is None:
             raise gym.error.ResetNeeded("Call reset before the first step.")
         return self._state
 
     def reset(self, seed: int) -> None:
-        """Start all environments anew, each from an initial state of its own."""
+        """Reset all environments, each to an initial state of its own."""
         self._state = self._draw_states(seed)
         self._steps[:] = 0
 
     def stagger(self, generator: np.random.Generator) -> None:
-        """Put each environment at a random step of its episode, as far as its time limit goes."""
+        """Let each environment's time limit count from a random step, to end at different times."""
         self._steps[:] = generator.integers(self.max_episode_steps, size=len(self._steps))
 
     def step(self, actions: Tree) -> None:
         """Advance all environments.
 
-        :param actions: float32, shape ``(num_envs, action_dim)``
+        :param actions: Float32, shape (num_envs, action_dim).
         """
         self._state = self._step(self.state, jax.device_put(actions, self._device))
         self._steps += self._action_repeat
 
     def renew(self, which: NDArray[np.bool_], seed: int) -> None:
-        """Start some environments anew, from fresh initial states.
+        """Reset some environments to new initial states.
 
-        States are drawn for all and used where needed: of fixed shape, so compiled once. This costs
-        a batched reset, but only in steps in which an episode ends.
+        States are drawn for all environments and used where needed: the shape is fixed, so this is
+        compiled once. It costs a batched reset, in those steps in which an episode ends.
 
-        :param which: which environments, shape ``(num_envs,)``
-        :param seed: of the initial states
+        :param which: Which environments, shape (num_envs,).
+        :param seed: Seed of the initial states.
         """
         self._state = self._select(which, self._draw_states(seed), self.state)
         self._steps[which] = 0
 
     @property
     def terminated(self) -> NDArray[np.bool_]:
-        """Whether each task has ended, shape ``(num_envs,)``."""
+        """Whether each task has ended, shape (num_envs,)."""
         return np.asarray(self.state.done) > 0
 
     @property
     def truncated(self) -> NDArray[np.bool_]:
-        """Whether each environment is at its time limit, shape ``(num_envs,)``."""
+        """Whether each environment is at its time limit, shape (num_envs,)."""
         return self._steps >= self.max_episode_steps
 
     def observation_space(self) -> gym.Space[Any]:
@@ -189,7 +189,7 @@ class PlaygroundBatch:
         return jax.dlpack.from_dlpack(actions.cpu() if self._device.platform == "cpu" else actions)
 
     def _action_bounds(self, task: str) -> NDArray[np.float64]:
-        """Lower and upper bounds, shape ``(action_dim, 2)``.
+        """Lower and upper bounds, shape (action_dim, 2).
 
         In the control suite actions are the actuators' controls, elsewhere offsets that Playground
         trains within [-1, 1].
@@ -199,13 +199,13 @@ class PlaygroundBatch:
         return np.tile([-1.0, 1.0], (self.env.action_size, 1))
 
     def _draw_states(self, seed: int) -> Tree:
-        # JAX compiles anew if some arrays are bound to a device that were not, or the other way.
+        # JAX compiles again if an array is bound to a device in one call and not in the other.
         return self._reset(jax.device_put(np.uint32(seed), self._device))
 
     def _start(self, seed: Tree) -> Tree:
         keys = jax.random.split(jax.random.PRNGKey(seed), self.num_envs)
         state = jax.vmap(self.env.reset)(keys)
-        # With the types that a step returns, so that the first step is not compiled on its own.
+        # With the types that a step returns, or the first step would be compiled separately.
         actions = jnp.zeros((self.num_envs, self.env.action_size), jnp.float32)
         after = jax.eval_shape(self._advance, state, actions)
         return jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), state, after)
@@ -217,7 +217,7 @@ class PlaygroundBatch:
             after, more = self._advance_once(state, actions)
             state = self._replace(has_ended, state, after)
             reward = reward + jnp.where(has_ended, 0, more)
-        # An explicit type is a strong one: a weak one would have the next step compiled again.
+        # An explicit dtype is "strong" in JAX: with a weak one the next step is compiled again.
         return jax.tree.map(
             lambda leaf: jnp.asarray(leaf, leaf.dtype), state.replace(reward=reward)
         )

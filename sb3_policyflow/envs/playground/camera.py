@@ -1,7 +1,5 @@
 """Pictures of simulations that run on JAX, drawn by MuJoCo on the host."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco
@@ -15,9 +13,9 @@ HEIGHT, WIDTH = 240, 320
 class Camera:
     """Draws single environments of a batch, as the model's first camera sees them.
 
-    Nothing is needed of OpenGL before the first picture.
+    OpenGL is needed only once a picture is drawn.
 
-    :param model: MuJoCo's model
+    :param model: MuJoCo's model.
     """
 
     def __init__(self, model: Any) -> None:
@@ -27,11 +25,11 @@ class Camera:
         self._renderer: Any = None
 
     def picture(self, data: Any, index: int) -> NDArray[np.uint8]:
-        """Colors, shape ``(HEIGHT, WIDTH, 3)``.
+        """Colors, shape (HEIGHT, WIDTH, 3).
 
-        :param data: the batch's data
-        :param index: which environment
-        :raises DependencyNotInstalled: if MuJoCo finds no OpenGL to draw with
+        :param data: The batch's data.
+        :param index: Which environment.
+        :raises DependencyNotInstalled: If MuJoCo finds no OpenGL to draw with.
         """
         self._renderer = self._renderer or _make_renderer(self._model)
         for field in ("qpos", "qvel", "mocap_pos", "mocap_quat"):
@@ -42,7 +40,7 @@ class Camera:
         return pixels
 
     def close(self) -> None:
-        """Free what OpenGL holds."""
+        """Free what OpenGL has allocated."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -1,15 +1,15 @@
 """Tasks of MuJoCo Playground (Zakka et al., 2025), simulated by MuJoCo MJX on JAX.
 
-The paper trains on ten of them, dm_control's tasks as Playground has them; every other one works
-too. They need the extra ``playground``, and JAX is imported when an environment is made. The tasks
-are the engine's own, down to the float32 rounding of its step function; added are
+The paper trains on ten of them, dm_control's tasks as Playground has them; the others work too.
+They need the extra ``playground``, and JAX is imported when an environment is made. Observations
+and rewards are those of Playground's own step function. What is added:
 
-- a time limit, the ``episode_length`` of the task's configuration: a truncation. A termination is
-  what the task itself says; in the control suite that is only a simulation that broke (a number
-  that is not one), whose reward is 0 here;
-- a fresh initial state for each episode, where Playground's training wrapper by default returns to
-  the first one that each environment had;
-- bounds of the actions. The environments do not clip; SB3's algorithms do before they act.
+- A time limit, the ``episode_length`` of the task's configuration, which is a truncation. Only the
+  task itself terminates an episode: in the control suite, if the simulation breaks (a value becomes
+  NaN). The reward of that step is 0 here.
+- A new initial state for each episode. By default, Playground's training wrapper returns each
+  environment to the first state that it had.
+- Bounds of the actions. The environments do not clip; SB3's algorithms do before they act.
 
 A step is one compiled function for all environments. Compiling it takes from ten seconds to a
 minute, once for each number of environments; JAX_COMPILATION_CACHE_DIR in the environment names a
@@ -29,7 +29,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_policyflow.envs.playground.tasks import load_task
-from sb3_policyflow.envs.vector import GymVectorVecEnv, Info
+from sb3_policyflow.envs.type_aliases import Float32Array, Info
+from sb3_policyflow.envs.vector import GymVectorVecEnv, final_infos, row
 
 if TYPE_CHECKING:
     from sb3_policyflow.envs.playground.batch import Overrides, PlaygroundBatch
@@ -40,21 +41,19 @@ METADATA: Info = {"render_modes": ["rgb_array"]}
 STAGGER = "init_at_random_ep_len"
 """The reset option of vectorized tasks."""
 
-FloatArray = NDArray[np.float32]
 
-
-class PlaygroundEnv(gym.Env[Any, FloatArray]):
+class PlaygroundEnv(gym.Env[Any, Float32Array]):
     """``Playground/NAME-v0``, one environment: a batch of one.
 
     For training, use ``PlaygroundVectorEnv``: its step takes little longer.
 
-    :param task: name of the task, for instance ``"CheetahRun"``
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated; None for the task's own.
+    :param task: Name of the task, for instance ``"CheetahRun"``.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :param max_episode_steps: Steps after which an episode is truncated; None for the task's own.
         That of ``gymnasium.make`` is a wrapper's, and can only end episodes sooner:
-        ``config_overrides={"episode_length": ...}`` sets any limit
-    :param config_overrides: changes to Playground's configuration of the task, such as
-        ``{"impl": "warp", "sim_dt": 0.005}``; nested, or with dots in its keys
+        ``config_overrides={"episode_length": ...}`` sets any limit.
+    :param config_overrides: Changes to Playground's configuration of the task, such as
+        ``{"impl": "warp", "sim_dt": 0.005}``; nested, or with dots in its keys.
     """
 
     metadata = METADATA
@@ -77,12 +76,12 @@ class PlaygroundEnv(gym.Env[Any, FloatArray]):
         super().reset(seed=seed)
         _refuse(options)
         self.batch.reset(_draw_seed(self.np_random))
-        return _row(to_numpy(self.batch.state.obs), 0), {}
+        return row(to_numpy(self.batch.state.obs), 0), {}
 
-    def step(self, action: FloatArray) -> tuple[Any, float, bool, bool, Info]:
+    def step(self, action: Float32Array) -> tuple[Any, float, bool, bool, Info]:
         self.batch.step(np.asarray(action, np.float32)[None])
         return (
-            _row(to_numpy(self.batch.state.obs), 0),
+            row(to_numpy(self.batch.state.obs), 0),
             float(self.batch.state.reward[0]),
             bool(self.batch.terminated[0]),
             bool(self.batch.truncated[0]),
@@ -100,10 +99,9 @@ class PlaygroundEnv(gym.Env[Any, FloatArray]):
 class TensorStep(NamedTuple):
     """What ``PlaygroundVectorEnv.step_tensors`` returns, for n environments.
 
-    Observations (n, ...), where an episode has ended those of the next one; rewards (n,); whether
-    the task has ended, and whether the time has (n,), both on the CPU; and the observations before
-    any reset, of which those of ended episodes are their last. Observations are dictionaries if the
-    space is.
+    Observations (n, ...), which are the next episode's first where an episode has ended; rewards
+    (n,); whether the task or the time limit has ended the episode, (n,) each, both on the CPU; and
+    the observations before any reset. Observations are dictionaries if the space is a ``Dict``.
     """
 
     observations: Any
@@ -113,7 +111,7 @@ class TensorStep(NamedTuple):
     final_observations: Any
 
 
-class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
+class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, Float32Array, NDArray[Any]]):
     """``Playground/NAME-v0``, ``num_envs`` environments in one batch.
 
     Same-step autoreset: when an episode ends, the next one's first observation is returned, and
@@ -127,11 +125,11 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     its time limit, so that from then on their episodes end at different times (the option of this
     name is RSL-RL's).
 
-    :param task: name of the task, for instance ``"CheetahRun"``
-    :param num_envs: number of environments
-    :param render_mode: ``None`` or ``"rgb_array"``
-    :param max_episode_steps: steps after which an episode is truncated; None for the task's own
-    :param config_overrides: changes to Playground's configuration of the task
+    :param task: Name of the task, for instance ``"CheetahRun"``.
+    :param num_envs: Number of environments.
+    :param render_mode: ``None`` or ``"rgb_array"``.
+    :param max_episode_steps: Steps after which an episode is truncated; None for the task's own.
+    :param config_overrides: Changes to Playground's configuration of the task.
     """
 
     def __init__(
@@ -164,11 +162,11 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
         return to_numpy(self.batch.state.obs), {}
 
     def step(
-        self, actions: FloatArray
+        self, actions: Float32Array
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], Info]:
         final, rewards, terminated, truncated = self._advance(np.asarray(actions, np.float32))
         done = terminated | truncated
-        infos = _final_infos(to_numpy(final), done) if done.any() else {}
+        infos = final_infos(to_numpy(final), done) if done.any() else {}
         return to_numpy(self.batch.state.obs), to_numpy(rewards), terminated, truncated, infos
 
     def reset_tensors(self, seed: int | None = None) -> Any:
@@ -206,7 +204,7 @@ class PlaygroundVectorEnv(gym.vector.VectorEnv[Any, FloatArray, NDArray[Any]]):
     def _advance(self, actions: Any) -> tuple[Any, Any, NDArray[np.bool_], NDArray[np.bool_]]:
         """Step, and reset where an episode has ended.
 
-        :return: observations before any reset and rewards on JAX's device, and the two flags
+        :return: Observations before any reset and rewards on JAX's device, and the two flags.
         """
         batch = self.batch
         if actions.shape != self.action_space.shape:
@@ -230,10 +228,10 @@ class PlaygroundVecEnv(GymVectorVecEnv):
     ``set_options({"init_at_random_ep_len": True})`` is for the next ``reset`` alone, as are all
     reset options in SB3.
 
-    :param task: name of the task, for instance ``"CheetahRun"``
-    :param num_envs: number of environments
-    :param seed: seed of the first ``reset``; ``seed()`` sets another
-    :param options: further arguments of ``PlaygroundVectorEnv``
+    :param task: Name of the task, for instance ``"CheetahRun"``.
+    :param num_envs: Number of environments.
+    :param seed: Seed of the first ``reset``; ``seed()`` sets another.
+    :param options: Further arguments of ``PlaygroundVectorEnv``.
     """
 
     env: PlaygroundVectorEnv
@@ -250,20 +248,6 @@ def to_numpy(arrays: Any) -> Any:
     return np.array(arrays, np.float32)
 
 
-def _row(observations: Any, index: int) -> Any:
-    """The observation of one environment."""
-    if isinstance(observations, dict):
-        return {key: values[index] for key, values in observations.items()}
-    return observations[index]
-
-
-def _final_infos(observations: Any, done: NDArray[np.bool_]) -> Info:
-    final_obs = np.full(len(done), None, dtype=object)
-    for i in np.flatnonzero(done).tolist():
-        final_obs[i] = _row(observations, i)
-    return {"final_obs": final_obs, "_final_obs": done}
-
-
 def _draw_seed(generator: np.random.Generator) -> int:
     return int(generator.integers(2**32))
 
@@ -271,12 +255,13 @@ def _draw_seed(generator: np.random.Generator) -> int:
 def _refuse(options: Info | None) -> None:
     if options:
         raise ValueError(
-            f"Tasks of MuJoCo Playground start as they will: reset takes no options {options}."
+            "Tasks of MuJoCo Playground draw their own initial states: reset takes no options "
+            f"{options}."
         )
 
 
 def _wants_stagger(options: Info | None) -> bool:
-    """Whether ``init_at_random_ep_len`` is asked for; other options are refused."""
+    """Whether the options have ``init_at_random_ep_len``; others are refused."""
     others = dict(options or {})
     stagger = others.pop(STAGGER, False)
     _refuse(others)

@@ -1,4 +1,4 @@
-"""Finding MuJoCo Playground and its tasks, and saying in a sentence what is missing."""
+"""Finds MuJoCo Playground and its tasks, or says in a sentence what is missing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gymnasium.error import DependencyNotInstalled, NameNotFound
 
-from sb3_policyflow.envs.extras import import_extra
+from sb3_policyflow.envs.extras import import_extra, install_command
 from sb3_policyflow.envs.task_names import PLAYGROUND
 
 if TYPE_CHECKING:
@@ -22,8 +22,9 @@ OLDEST_VERSION = (0, 2)
 def require_task(task: str) -> None:
     """Import MuJoCo Playground and look for a task.
 
-    :raises DependencyNotInstalled: if it is missing, too old, or does not work here
-    :raises NameNotFound: if it has no such task; with the nearest names
+    :param task: Name of the task.
+    :raises DependencyNotInstalled: If it is missing, too old, or does not work here.
+    :raises NameNotFound: If it has no such task; with the nearest names.
     """
     _require_playground(f"{PLAYGROUND}{task}-v0")
     from sb3_policyflow.envs.playground.batch import all_tasks
@@ -36,16 +37,16 @@ def require_task(task: str) -> None:
 
 
 def _require_playground(env_id: str) -> None:
-    """Look at the version first: an old one may fail when it is imported, and say little."""
+    """Check the version before the import, in which an old one may fail without saying why."""
     try:
         version = importlib.metadata.version("playground")
     except importlib.metadata.PackageNotFoundError:
-        version = None  # missing, or a checkout on the path
+        version = None  # Missing, or a checkout on the path.
     if version and tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST_VERSION:
         oldest = ".".join(map(str, OLDEST_VERSION))
         raise DependencyNotInstalled(
             f"{env_id} needs playground {oldest} or newer, and {version} is installed: "
-            "pip install --upgrade 'sb3-policyflow[playground]'"
+            f"{install_command('playground')}"
         )
     import_extra("mujoco_playground", "playground", env_id)
 
@@ -55,8 +56,13 @@ def load_task(
 ) -> PlaygroundBatch:
     """A batch of environments of a task.
 
-    :raises DependencyNotInstalled: if Playground, or the robots of the task, cannot be had
-    :raises NameNotFound: if there is no such task
+    :param task: Name of the task.
+    :param num_envs: Number of environments.
+    :param max_episode_steps: Time limit; None for the task's ``episode_length``.
+    :param overrides: Changes to the task's configuration, if any.
+    :raises DependencyNotInstalled: If Playground or the robots of the task are missing and cannot
+        be downloaded.
+    :raises NameNotFound: If there is no such task.
     """
     require_task(task)
     from sb3_policyflow.envs.playground.batch import PlaygroundBatch
@@ -74,7 +80,7 @@ def load_task(
 
 
 def _is_about_robots(error: OSError | subprocess.CalledProcessError) -> bool:
-    """Whether git failed or is missing, or its clone of mujoco_menagerie is not whole."""
+    """Whether git failed or is missing, or its clone of mujoco_menagerie is incomplete."""
     if isinstance(error, subprocess.CalledProcessError):
         return True
     return error.filename == "git" or "mujoco_menagerie" in str(error.filename)

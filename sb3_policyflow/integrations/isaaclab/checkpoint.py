@@ -1,4 +1,4 @@
-"""A model to go on from: it brings its own hyperparameters, and the statistics saved with it."""
+"""Resuming from a saved model, with its own hyperparameters and normalization statistics."""
 
 import pickle
 import re
@@ -19,10 +19,10 @@ FOR_THE_SCRIPT = ("n_steps", "timeout_bootstrap", "seed")
 
 
 class Checkpoint(NamedTuple):
-    """What a run goes on from.
+    """What a run resumes from.
 
     ``hyperparameters`` are those that :data:`FOR_THE_SCRIPT` names. ``statistics`` have no
-    environment yet, and are None if the model was trained without.
+    environment yet, and are None if the model was trained without ``VecNormalize``.
     """
 
     path: Path
@@ -31,7 +31,7 @@ class Checkpoint(NamedTuple):
 
 
 def read_checkpoint(path: Path, overrides: Sequence[str]) -> Checkpoint:
-    """See whether a model can be gone on from, before the simulator starts.
+    """Check that training can resume from a model, before the simulator starts.
 
     :param path: Its file, whose name may be given without its ``.zip``.
     :param overrides: What the command line changes in IsaacLab's configuration.
@@ -42,7 +42,7 @@ def read_checkpoint(path: Path, overrides: Sequence[str]) -> Checkpoint:
     changes = [change for change in overrides if _is_of_the_model(change)]
     if changes:
         raise LabError(
-            "A model that is gone on from has its own hyperparameters: leave out "
+            "A model that is resumed has its own hyperparameters: leave out "
             f"{', '.join(changes)}, or --checkpoint."
         )
     with _refused_if_unreadable(path):
@@ -60,13 +60,13 @@ def find_checkpoint(path: Path) -> Path:
     for candidate in (path, path.with_name(f"{path.name}.zip")):
         if candidate.is_file():
             return candidate
-    raise LabError(f"There is no model {path} to go on from: correct --checkpoint.")
+    raise LabError(f"There is no model {path} to resume from: correct --checkpoint.")
 
 
 def _is_of_the_model(override: str) -> bool:
-    """Whether it changes a hyperparameter; how long to train is none of the model's.
+    """Whether it changes a hyperparameter of the model, which ``n_timesteps`` is not.
 
-    Version 3 can also replace all of them at once.
+    Version 3 of IsaacLab can also replace all of them at once.
 
     >>> [_is_of_the_model(o) for o in ("++agent.gamma=0.9", "agent.n_timesteps=9", "env.x=1")]
     [True, False, False]
@@ -79,26 +79,26 @@ def _is_of_the_model(override: str) -> bool:
 
 @contextmanager
 def _refused_if_unreadable(path: Path) -> Iterator[None]:
-    """Files hold pickles, which fail with any exception, and at length."""
+    """Turn an error into one line: files hold pickles, which may raise any exception."""
     try:
         yield
     except Exception as error:
         reason = str(error).partition("\n")[0]
-        raise LabError(f"{path} cannot be gone on from: {reason}") from error
+        raise LabError(f"{path} cannot be resumed: {reason}") from error
 
 
 def _read_statistics(checkpoint: Path, data: dict[str, Any]) -> VecNormalize | None:
-    """The statistics of a model, which tells whether it has any.
+    """The statistics saved with a model, if it was trained with ``VecNormalize``.
 
-    What lies beside it may be those of an earlier run, and a file can get lost.
+    The model says whether it was: a file beside it may be of an earlier run, or get lost.
 
     :param checkpoint: The model's file.
-    :param data: What it holds.
-    :raises LabError: If they are missing, or cannot be loaded.
+    :param data: Its content.
+    :raises LabError: If statistics are missing, or cannot be loaded.
     """
     path = statistics_of(checkpoint)
     state: ResumeState | None = data.get("resume_state")
-    # SB3 lets users leave that out of a file, which then does not tell.
+    # A user may have left the state out with SB3's ``exclude``; then the file beside it decides.
     if not (path.is_file() if state is None else state.normalized_returns is not None):
         return None
     if not path.is_file():
@@ -114,7 +114,7 @@ def _read_statistics(checkpoint: Path, data: dict[str, Any]) -> VecNormalize | N
 
 
 def statistics_of(checkpoint: Path) -> Path:
-    """Where the statistics of ``VecNormalize`` are that were saved with a model.
+    """The file of the ``VecNormalize`` statistics that were saved with a model.
 
     >>> statistics_of(Path("logs/model_98304_steps.zip")).name
     'model_vecnormalize_98304_steps.pkl'

@@ -1,4 +1,4 @@
-"""What differs between versions of IsaacLab: how it starts, and how a task is configured."""
+"""What differs between IsaacLab 2 and 3: how the simulator starts and how tasks are configured."""
 
 import argparse
 import difflib
@@ -18,11 +18,11 @@ Launched = AbstractContextManager["Configured"]
 
 
 class LabError(ValueError):
-    """Something about IsaacLab that its user must change."""
+    """An error that the user must mend, in one sentence that says how."""
 
 
 class Configured(NamedTuple):
-    """A task as it is to be run, once the simulator is up."""
+    """Configurations of the environment and of the agent, once the simulator has started."""
 
     env: Any
     agent: dict[str, Any]
@@ -40,7 +40,7 @@ class Lab(NamedTuple):
 
 
 def find_lab() -> Lab:
-    """The installed IsaacLab, which is told by what it can do: versions of checkouts say little.
+    """The installed IsaacLab, recognized by its functions: checkouts may have any version number.
 
     :raises LabError: If there is none, or one that is too old.
     """
@@ -48,7 +48,7 @@ def find_lab() -> Lab:
         app = importlib.import_module("isaaclab.app")
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "isaaclab":
-            raise  # IsaacLab is there, and lacks something of its own
+            raise  # IsaacLab is installed, but one of its dependencies is missing.
         raise LabError(_how_to_install()) from error
     if hasattr(app, "launch_simulation"):
         return Lab(app.add_launcher_args, _launched_three)
@@ -82,7 +82,7 @@ def _has_module(name: str) -> bool:
 
 @contextmanager
 def _launched_two(options: argparse.Namespace, overrides: list[str]) -> Iterator[Configured]:
-    """The simulator comes first: tasks cannot be imported without it."""
+    """Start the simulator first, because tasks cannot be imported without it."""
     simulation = importlib.import_module("isaaclab.app").AppLauncher(options).app
     check_task(options.task, options.agent)
     hydra = importlib.import_module("isaaclab_tasks.utils.hydra")
@@ -92,13 +92,13 @@ def _launched_two(options: argparse.Namespace, overrides: list[str]) -> Iterator
             lambda env, agent: found.append(Configured(env, agent))
         )()
     yield found[0]
-    # Closing ends the process, so an error must pass first.
+    # Not in a finally block: closing ends the process, and would hide an error.
     simulation.close()
 
 
 @contextmanager
 def _launched_three(options: argparse.Namespace, overrides: list[str]) -> Iterator[Configured]:
-    """The configuration comes first: it decides which simulator to start."""
+    """Configure first, because the configuration decides which simulator to start."""
     check_task(options.task, options.agent)
     utils = importlib.import_module("isaaclab_tasks.utils")
     configured = Configured(
@@ -110,7 +110,7 @@ def _launched_three(options: argparse.Namespace, overrides: list[str]) -> Iterat
 
 @contextmanager
 def _arguments(overrides: list[str]) -> Iterator[None]:
-    """Hydra reads its overrides from the command line."""
+    """Put the overrides on the command line, where Hydra reads them."""
     original, sys.argv = sys.argv, [sys.argv[0], *overrides]
     try:
         yield
@@ -119,11 +119,11 @@ def _arguments(overrides: list[str]) -> Iterator[None]:
 
 
 def check_task(task: str, agent: str) -> None:
-    """Register IsaacLab's tasks and the presets, and see whether a task can be trained.
+    """Register IsaacLab's tasks and the presets, and check that a task can be trained.
 
     :param task: Its id.
     :param agent: The registry's key of its hyperparameters.
-    :raises LabError: If there is no such task, with the nearest ones, or none of its
+    :raises LabError: If there is no such task, with similar names; or if it has no such
         hyperparameters.
     """
     importlib.import_module("isaaclab_tasks")
@@ -143,7 +143,7 @@ def check_task(task: str, agent: str) -> None:
 
 
 def _nearest(task: str) -> str:
-    """What a task may have been called instead: first what another version calls the same."""
+    """Names that may have been meant: first that of the same task in the other version."""
     renamed = [name for names in TASKS.values() if task in names for name in names if name]
     tasks = [name for name, spec in gym.registry.items() if "env_cfg_entry_point" in spec.kwargs]
     near = [name for name in renamed if name in tasks]
@@ -155,8 +155,8 @@ def wrap(env: Any, bounds: tuple[float, float]) -> Any:
     """IsaacLab's environment as an SB3 ``VecEnv``.
 
     :param env: What ``gymnasium.make`` returned.
-    :param bounds: Bounds for actions that have none. Version 2 knows no other than +-100.
-    :raises LabError: If version 2 is asked for others.
+    :param bounds: Bounds for actions that have none. Version 2 has -100 and 100 only.
+    :raises LabError: If these are other bounds, and it is version 2.
     """
     wrapper = importlib.import_module("isaaclab_rl.sb3").Sb3VecEnvWrapper
     if "action_bounds" in inspect.signature(wrapper).parameters:
@@ -170,20 +170,20 @@ def wrap(env: Any, bounds: tuple[float, float]) -> Any:
 
 
 def prepare_timeouts(env_config: Any, timeout_bootstrap: str) -> None:
-    """See to it that time limits can be bootstrapped as they are asked to be.
+    """Configure the environment for the way in which time limits are bootstrapped.
 
-    What IsaacLab gives as the last observation of an episode is the first of the next, unless
-    version 3 is told to compute the last one.
+    As an episode's last observation IsaacLab returns the next episode's first one, unless version 3
+    is told to compute the last one.
 
     :param env_config: The environment's configuration, changed in place.
-    :param timeout_bootstrap: Argument of the algorithm.
-    :raises LabError: If the last observations cannot be had.
+    :param timeout_bootstrap: The algorithm's argument of this name.
+    :raises LabError: If it needs last observations, which version 2 does not return.
     """
     if timeout_bootstrap != "terminal":
         return
     if not hasattr(env_config, "compute_final_obs"):
         raise LabError(
-            "This version of IsaacLab does not tell the last observation of an episode, which "
+            "This version of IsaacLab does not return the last observation of an episode, which "
             "timeout_bootstrap='terminal' needs: train with agent.timeout_bootstrap=current, as "
             "the presets do, or use IsaacLab 3."
         )

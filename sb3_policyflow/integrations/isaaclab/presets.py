@@ -1,8 +1,8 @@
-"""Hyperparameters of the paper's eight IsaacLab tasks, as IsaacLab's registry takes them.
+"""Hyperparameters of the paper's eight IsaacLab tasks, in the form of IsaacLab's registry.
 
-Each is a function without arguments that returns a new dictionary of plain values, in the form of
-IsaacLab's own files for Stable-Baselines3: "nn.ELU" stands for the class, and ``n_minibatches`` for
-the ``batch_size`` that it makes.
+Each is a function without arguments that returns a new dictionary of plain values, as in IsaacLab's
+own files for Stable-Baselines3: "nn.ELU" for the class, and ``n_minibatches`` instead of
+``batch_size``.
 """
 
 from functools import partial
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 
 AGENT_KEY = "sb3_policyflow_cfg_entry_point"
-"""What IsaacLab's registry has the hyperparameters under, and ``--agent`` names by default."""
+"""The key of the hyperparameters in IsaacLab's registry, and the default of ``--agent``."""
 
 PAPER_N_ENVS = 4096
 
@@ -26,15 +26,15 @@ def agent(
     gamma: float = 0.99,
     embedding_dim: int = 64,
 ) -> dict[str, Any]:
-    """Arguments of PolicyFlow: those of one task, with those that the paper has for all of them.
+    """Arguments of PolicyFlow: those of one task, and those that all tasks of the paper share.
 
     :param net_arch: Hidden layers of actor and critic.
-    :param learning_rate: Where the adaptive learning rate starts.
+    :param learning_rate: Initial value of the adaptive learning rate.
     :param ent_coef: w_g.
     :param brownian_coef: w_b.
-    :param n_steps: Rollout of each environment.
-    :param n_iterations: Updates, which the paper does not tell: those of IsaacLab's own
-        configurations for RSL-RL, in 4096 environments.
+    :param n_steps: Steps of each environment in a rollout.
+    :param n_iterations: Number of updates. The paper does not give it: these are those of
+        IsaacLab's own configurations for RSL-RL, in 4096 environments.
     :param gamma: Discount factor.
     :param embedding_dim: Size of the time and observation embeddings.
     """
@@ -57,7 +57,7 @@ def agent(
         "max_grad_norm": 1.0,
         "n_flow_steps": 12,
         "solver": "midpoint",
-        # The value of the last observation that the policy has seen, as in RSL-RL.
+        # From the last observation that the policy has seen, as RSL-RL does.
         "timeout_bootstrap": "current",
         "policy_kwargs": {
             "net_arch": list(net_arch),
@@ -81,7 +81,7 @@ rough_g1 = partial(agent, LARGE, 1e-3, 0.002, 0.006, 24, 3000, embedding_dim=256
 
 
 class Names(NamedTuple):
-    """What a task is called in IsaacLab 2.x and 3.x; None where it has not been found."""
+    """Ids of one task in IsaacLab 2 and 3; None if version 3 seems not to have it."""
 
     two: str
     three: str | None
@@ -99,15 +99,15 @@ TASKS: dict[str, Names] = {
     "open_drawer_franka": Names("Isaac-Open-Drawer-Franka-v0", "Isaac-Open-Drawer-Franka"),
     "rough_g1": Names("Isaac-Velocity-Rough-G1-v0", "Isaac-Velocity-Rough-G1"),
 }
-"""The preset of each task, by the name that this module has it under."""
+"""Ids of the tasks, by the names of their presets in this module."""
 
 
 def register_presets() -> list[str]:
     """Add the presets to those of the paper's tasks that IsaacLab has registered with Gymnasium.
 
-    A preset that is there already is somebody's own, and stays.
+    Hyperparameters that a user has registered under the same key are kept.
 
-    :return: Ids of the tasks that have one now.
+    :return: Ids of the tasks that have hyperparameters now.
     """
     found = []
     for preset, names in TASKS.items():

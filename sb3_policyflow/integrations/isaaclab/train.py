@@ -24,15 +24,15 @@ from sb3_policyflow.policyflow import PolicyFlow
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 
 NORMALIZATION = ("normalize_input", "normalize_value", "clip_obs")
-"""Keys of IsaacLab's files for Stable-Baselines3 that configure ``VecNormalize``."""
+"""Keys that configure ``VecNormalize`` in IsaacLab's files for Stable-Baselines3."""
 
 
 def main(arguments: list[str]) -> int:
-    """Train, as the command line says.
+    """The command.
 
-    :param arguments: Those of the command line.
+    :param arguments: Arguments of the command line.
     :return: The exit code.
-    :raises SystemExit: With a sentence, if something must be changed first.
+    :raises SystemExit: With a sentence that says what to change, if it cannot run.
     """
     parser = make_parser()
     try:
@@ -65,10 +65,10 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--task", required=True, help="the task's id")
     parser.add_argument(
-        "--num_envs", type=int, help="environments; the task's own number if not given"
+        "--num_envs", type=int, help="environments, instead of the task's own number"
     )
     parser.add_argument(
-        "--seed", type=int, help="seed; that of the hyperparameters or the model if not given"
+        "--seed", type=int, help="seed, instead of that of the hyperparameters or the model"
     )
     parser.add_argument("--max_iterations", type=int, help="updates, instead of agent.n_timesteps")
     parser.add_argument(
@@ -77,11 +77,13 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--checkpoint",
         type=Path,
-        help="a model to go on from, with its own hyperparameters, for as many timesteps again",
+        help="a model to resume, with its own hyperparameters, for as many timesteps again",
     )
     parser.add_argument("--save_interval", type=int, default=50, help="updates between checkpoints")
     parser.add_argument(
-        "--log_dir", type=Path, help="where to write; logs/sb3_policyflow/TASK/TIME"
+        "--log_dir",
+        type=Path,
+        help="folder, instead of logs/sb3_policyflow/TASK/TIME",
     )
     parser.add_argument(
         "--action_bounds",
@@ -97,13 +99,16 @@ def make_parser() -> argparse.ArgumentParser:
 def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
     """Make the environment, and train in it.
 
-    :param configured: The task, whose configuration is changed in place.
-    :param options: The command line, whose checkpoint has been read.
+    :param configured: The task; its configuration is changed in place.
+    :param options: The parsed command line, with the :class:`Checkpoint` that it names.
     :return: The trained model.
     """
     config = configured.env
+    if options.num_envs is not None:
+        config.scene.num_envs = options.num_envs
+    if getattr(options, "device", None) is not None:
+        config.sim.device = options.device
     saved = {} if options.checkpoint is None else options.checkpoint.hyperparameters
-    apply_options(config, options)
     agent, n_timesteps, normalization = read_agent(
         {**configured.agent, **saved}, config.scene.num_envs, options.max_iterations, options.seed
     )
@@ -117,26 +122,18 @@ def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
         env.close()
 
 
-def apply_options(config: Any, options: argparse.Namespace) -> None:
-    """Let the command line change the environment's configuration."""
-    if options.num_envs is not None:
-        config.scene.num_envs = options.num_envs
-    if getattr(options, "device", None) is not None:
-        config.sim.device = options.device
-
-
 def read_agent(
     agent: dict[str, Any], n_envs: int, n_iterations: int | None, seed: int | None
 ) -> tuple[dict[str, Any], int, dict[str, Any]]:
-    """Turn hyperparameters of the registry into what constructs and trains a model.
+    """Split hyperparameters of the registry into what constructs, trains and normalizes.
 
-    :param agent: As the registry has them.
+    :param agent: The hyperparameters in the registry's form.
     :param n_envs: Number of environments.
-    :param n_iterations: Updates to make, instead of ``n_timesteps``.
-    :param seed: Seed to take instead of theirs.
-    :return: Arguments of :class:`PolicyFlow`, the number of timesteps, and what there is about
-        normalization.
-    :raises LabError: If there is no number of timesteps.
+    :param n_iterations: Number of updates, instead of ``n_timesteps``.
+    :param seed: Seed, instead of theirs.
+    :return: Arguments of :class:`PolicyFlow`, the number of timesteps, and the options of
+        :data:`NORMALIZATION`.
+    :raises LabError: If the number of timesteps is missing.
     """
     agent = importlib.import_module("isaaclab_rl.sb3").process_sb3_cfg(dict(agent), n_envs)
     agent["seed"] = agent.get("seed") if seed is None else seed
@@ -162,9 +159,9 @@ def train(
 
     :param env: The wrapped environment.
     :param agent: Arguments of :class:`PolicyFlow`.
-    :param n_timesteps: How long.
+    :param n_timesteps: Number of timesteps.
     :param normalization: See :data:`NORMALIZATION`.
-    :param options: The command line, whose checkpoint has been read.
+    :param options: The parsed command line, with the :class:`Checkpoint` that it names.
     :return: The trained model.
     """
     moment = time.strftime("%Y-%m-%d_%H-%M-%S")
@@ -175,7 +172,7 @@ def train(
             agent.pop("policy"), env, verbose=1, tensorboard_log=str(folder), **agent
         )
     else:
-        # A seed starts the random generators anew; without one they go on.
+        # A seed restarts the random generators; without one they continue.
         seed = {} if options.seed is None else {"seed": options.seed}
         model = PolicyFlow.load(
             options.checkpoint.path, env=env, tensorboard_log=str(folder), **seed
@@ -202,7 +199,7 @@ def normalized(
     :param env: The environment.
     :param options: See :data:`NORMALIZATION`.
     :param gamma: Discount factor, which scales rewards.
-    :param checkpoint: A model to go on from, as it was trained: whatever the hyperparameters say.
+    :param checkpoint: A model to resume, which is normalized as it was, whatever the options say.
     """
     if checkpoint is not None:
         if checkpoint.statistics is None:

@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[2]
 
 
 def extend_experiment(manager: Any, own_algorithms: Container[str], config_given: bool) -> None:
-    """Adapt a new ``ExperimentManager`` where its run is of this package's concern.
+    """Adapt a new ``ExperimentManager`` if its algorithm or environment is this package's.
 
     :param manager: rl_zoo3's ``ExperimentManager``.
     :param own_algorithms: Names of this package's algorithms.
@@ -26,7 +26,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
     is_own_algorithm = manager.algo in own_algorithms
     if not config_given:
         manager.config = choose_config(manager.algo, env_id, manager.config)
-    # Another class than DummyVecEnv is somebody's explicit choice.
+    # Any other class than DummyVecEnv has been chosen explicitly.
     if manager.vec_env_class is DummyVecEnv and has_own_vectorization(
         gym.spec(env_id), of_this_package=not is_own_algorithm
     ):
@@ -38,9 +38,11 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
 def choose_config(algo: str, env_id: str, theirs: str) -> str:
     """The file with the hyperparameters of an algorithm in an environment.
 
-    rl_zoo3's own where it names the environment, else this package's where that does, else the
-    one that there is.
+    rl_zoo3's own if it has an entry for the environment, else this package's if that has one, else
+    whichever exists.
 
+    :param algo: Name of the algorithm.
+    :param env_id: Id of the environment.
     :param theirs: rl_zoo3's file for the algorithm, which need not exist.
     """
     ours = hyperparams_folder() / f"{algo}.yml"
@@ -63,7 +65,10 @@ def _environments(config: Path) -> set[str]:
 
 
 def prune_if_diverged(objective: Callable[..., float]) -> Callable[..., float]:
-    """Prune a trial whose numbers overflow, as rl_zoo3 does where they raise a ``ValueError``."""
+    """Prune a trial whose numbers overflow; rl_zoo3 itself prunes those with a ``ValueError``.
+
+    :param objective: rl_zoo3's, which runs a trial and returns its result.
+    """
 
     @functools.wraps(objective)
     def prune(trial: Any) -> float:

@@ -1,6 +1,6 @@
-"""Registration with rl_zoo3, one function for each of its modules that this package adds to.
+"""Registration with rl_zoo3: one function for each of its modules to which this package adds.
 
-They run when the module has been executed (see ``sb3_policyflow_startup``), and may run again.
+They run after the module has been executed (see ``sb3_policyflow_startup``), and may run again.
 """
 
 import argparse
@@ -8,40 +8,15 @@ import functools
 import inspect
 import sys
 import warnings
-from collections.abc import Callable
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.integrations.rl_zoo3.experiment import extend_experiment
-from sb3_policyflow.integrations.rl_zoo3.samplers import (
-    convert_flow_params,
-    sample_dppo_params,
-    sample_fpo_params,
-    sample_policyflow_params,
-)
-
-Hyperparams = dict[str, Any]
-
-
-class Registration(NamedTuple):
-    """An algorithm, what draws its hyperparameters in a trial, and what rebuilds them later."""
-
-    algorithm: type[BaseAlgorithm]
-    sample: Callable[..., Hyperparams]
-    convert: Callable[[Hyperparams], Hyperparams]
-
-
-ALGORITHMS = {
-    "policyflow": Registration(PolicyFlow, sample_policyflow_params, convert_flow_params),
-    "fpo": Registration(FPO, sample_fpo_params, convert_flow_params),
-    "dppo": Registration(DPPO, sample_dppo_params, convert_flow_params),
-}
-"""What ``--algo`` takes; each has its ``hyperparams/NAME.yml``."""
+from sb3_policyflow.integrations.rl_zoo3.samplers import SAMPLERS, convert_flow_params
 
 
 def register(module: ModuleType) -> None:
@@ -59,16 +34,16 @@ def register(module: ModuleType) -> None:
 
 def _add_algorithms(utils: ModuleType) -> None:
     """Let ``--algo`` and ``--env`` know the algorithms and environments."""
-    for name, registration in ALGORITHMS.items():
-        utils.ALGOS.setdefault(name, registration.algorithm)
+    for name, algorithm in ALGORITHMS.items():
+        utils.ALGOS.setdefault(name, algorithm)
     _register_environment_of(sys.argv[1:])
 
 
 def _register_environment_of(arguments: list[str]) -> None:
-    """Register what a command's ``--env`` names.
+    """Register the environment that a command's ``--env`` names.
 
-    The commands look it up as soon as they have parsed it, and to register all there is would mean
-    to import all the packages that have environments.
+    The commands look it up right after parsing. To register every environment that this package
+    knows of would import every simulator.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--env", nargs="?")
@@ -81,15 +56,15 @@ def _register_environment_of(arguments: list[str]) -> None:
 
 def _add_search_spaces(hyperparams_opt: ModuleType) -> None:
     """Let ``--optimize`` and ``--trial-id`` know the search spaces."""
-    for name, registration in ALGORITHMS.items():
-        hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(name, registration.sample)
-        hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(name, registration.convert)
+    for name, sample in SAMPLERS.items():
+        hyperparams_opt.HYPERPARAMS_SAMPLER.setdefault(name, sample)
+        hyperparams_opt.HYPERPARAMS_CONVERTER.setdefault(name, convert_flow_params)
 
 
 def _extend_experiments(exp_manager: ModuleType) -> None:
-    """Let each new ``ExperimentManager`` go through :func:`extend_experiment`.
+    """Have :func:`extend_experiment` adapt each new ``ExperimentManager``.
 
-    Its environment is registered before, for scripts that have no command line.
+    Its environment is registered first, for scripts that do not name it on the command line.
     """
     manager_class = exp_manager.ExperimentManager
     construct = manager_class.__init__

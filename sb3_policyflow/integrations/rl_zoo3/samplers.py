@@ -1,10 +1,11 @@
 """Optuna search spaces, in the form that rl_zoo3 takes.
 
 A study keeps only the raw values that a trial drew. ``sample_...`` draws them and returns the
-hyperparameters; ``convert_flow_params`` makes the same hyperparameters of the raw values again.
+hyperparameters; ``convert_flow_params`` turns the raw values into the same hyperparameters again.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from optuna import Trial
@@ -25,23 +26,48 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 
-def sample_policyflow_params(
-    trial: Trial,
-    n_actions: int,  # noqa: ARG001
-    n_envs: int,
-    additional_args: dict[str, Any],  # noqa: ARG001
-) -> dict[str, Any]:
-    """Draw hyperparameters of PolicyFlow.
+Sampler = Callable[[Trial, int, int, dict[str, Any]], dict[str, Any]]
+"""What rl_zoo3 calls: with the trial, the number of action dimensions, the number of environments
+and what it has for other algorithms. It returns constructor arguments."""
 
-    :param trial: The trial that draws.
-    :param n_actions: Number of action dimensions.
-    :param n_envs: Number of environments that a rollout is collected from.
-    :param additional_args: What rl_zoo3 has for other algorithms.
-    :return: Constructor arguments, with complete ``policy_kwargs``.
+SAMPLERS: dict[str, Sampler] = {}
+"""The samplers of all algorithms, by the names of ``sb3_policyflow.algorithms``."""
+
+
+def sampler(
+    name: str, clip_ranges: Sequence[float] = (0.1, 0.2, 0.3)
+) -> Callable[[Callable[[Trial], dict[str, Any]]], Sampler]:
+    """Make a sampler of a function that draws what only its algorithm has.
+
+    :param name: The algorithm's name.
+    :param clip_ranges: Choices for its ``clip_range``.
     """
+
+    def complete(suggest_own: Callable[[Trial], dict[str, Any]]) -> Sampler:
+        @functools.wraps(suggest_own)
+        def sample(
+            trial: Trial,
+            n_actions: int,  # noqa: ARG001
+            n_envs: int,
+            additional_args: dict[str, Any],  # noqa: ARG001
+        ) -> dict[str, Any]:
+            params = {
+                **suggest_on_policy(trial, n_envs, clip_ranges),
+                **suggest_network(trial),
+                **suggest_own(trial),
+            }
+            return finish_sample(trial, params)
+
+        SAMPLERS[name] = sample
+        return sample
+
+    return complete
+
+
+@sampler("policyflow")
+def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
+    """Draw hyperparameters of PolicyFlow."""
     params = {
-        **suggest_on_policy(trial, n_envs),
-        **suggest_network(trial),
         "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
         "brownian_coef": trial.suggest_float("brownian_coef", 1e-4, 0.5, log=True),
         "path": trial.suggest_categorical("path", ["rectified", "stochastic", "trigflow"]),
@@ -51,19 +77,13 @@ def sample_policyflow_params(
     }
     if params["path"] != "stochastic":
         params["latent_std"] = trial.suggest_float("latent_std", 0.1, 1.0, log=True)
-    return finish_sample(trial, params)
+    return params
 
 
-def sample_fpo_params(
-    trial: Trial,
-    n_actions: int,  # noqa: ARG001
-    n_envs: int,
-    additional_args: dict[str, Any],  # noqa: ARG001
-) -> dict[str, Any]:
-    """Draw hyperparameters of FPO; see :func:`sample_policyflow_params`."""
-    params = {
-        **suggest_on_policy(trial, n_envs, clip_ranges=(0.01, 0.03, 0.05, 0.1)),
-        **suggest_network(trial),
+@sampler("fpo", clip_ranges=(0.01, 0.03, 0.05, 0.1))
+def sample_fpo_params(trial: Trial) -> dict[str, Any]:
+    """Draw hyperparameters of FPO."""
+    return {
         "n_probes": trial.suggest_categorical("n_probes", [4, 8, 16]),
         "probe_average": trial.suggest_categorical("probe_average", ["loss", "objective"]),
         "loss_target": trial.suggest_categorical("loss_target", ["epsilon", "velocity"]),
@@ -71,19 +91,12 @@ def sample_fpo_params(
         "difference_clamp": trial.suggest_categorical("difference_clamp", [3.0, 10.0]),
         "n_flow_steps": trial.suggest_categorical("n_flow_steps", [5, 10, 20]),
     }
-    return finish_sample(trial, params)
 
 
-def sample_dppo_params(
-    trial: Trial,
-    n_actions: int,  # noqa: ARG001
-    n_envs: int,
-    additional_args: dict[str, Any],  # noqa: ARG001
-) -> dict[str, Any]:
-    """Draw hyperparameters of DPPO; see :func:`sample_policyflow_params`."""
-    params = {
-        **suggest_on_policy(trial, n_envs),
-        **suggest_network(trial),
+@sampler("dppo")
+def sample_dppo_params(trial: Trial) -> dict[str, Any]:
+    """Draw hyperparameters of DPPO."""
+    return {
         "process": trial.suggest_categorical("process", ["ddpm", "flow"]),
         "n_denoising_steps": trial.suggest_categorical("n_denoising_steps", [5, 10, 20]),
         "min_sampling_std": trial.suggest_float("min_sampling_std", 0.03, 0.3, log=True),
@@ -92,19 +105,16 @@ def sample_dppo_params(
         "denoising_gamma": trial.suggest_categorical("denoising_gamma", [0.9, 0.99, 1.0]),
         "n_critic_warmup": trial.suggest_categorical("n_critic_warmup", [0, 2, 5]),
     }
-    return finish_sample(trial, params)
 
 
-def suggest_on_policy(
-    trial: Trial, n_envs: int, clip_ranges: Sequence[float] = (0.1, 0.2, 0.3)
-) -> dict[str, Any]:
+def suggest_on_policy(trial: Trial, n_envs: int, clip_ranges: Sequence[float]) -> dict[str, Any]:
     """Draw what every on-policy algorithm has, for rollouts that grow with ``n_envs``.
 
     The rollout has between 1024 and 32768 transitions, and at least 8 steps of each environment.
     """
     shortest = max(10, (n_envs - 1).bit_length() + 3)
     return {
-        # One value only: it is here for the study to keep it.
+        # A single value: it is drawn so that the study keeps it.
         "n_envs": trial.suggest_int("n_envs", n_envs, n_envs),
         "rollout_pow": trial.suggest_int("rollout_pow", shortest, max(15, shortest + 3)),
         "n_minibatches_pow": trial.suggest_int("n_minibatches_pow", 2, 6),
@@ -128,9 +138,9 @@ def suggest_network(trial: Trial) -> dict[str, Any]:
 
 
 def finish_sample(trial: Trial, params: dict[str, Any]) -> dict[str, Any]:
-    """Convert the raw values and show in the study what they stand for."""
+    """Convert the raw values, and note the converted ones in the study."""
     hyperparams = convert_flow_params(params)
-    # rl_zoo3 has made the environments already, and hands the rest to the constructor.
+    # rl_zoo3 has made the environments by now, and passes the rest to the constructor.
     del hyperparams["n_envs"]
     for name in ("gamma", "gae_lambda", "n_steps", "batch_size"):
         trial.set_user_attr(name, hyperparams[name])

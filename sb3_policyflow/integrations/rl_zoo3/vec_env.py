@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
@@ -17,6 +17,7 @@ EnvFn = Callable[[], gym.Env[Any, Any]]
 def has_own_vectorization(spec: EnvSpec, of_this_package: bool = False) -> bool:
     """Whether an environment says how to step many of its kind.
 
+    :param spec: The environment's registration.
     :param of_this_package: Whether only this package's environments count.
     """
     if spec.vector_entry_point is None:
@@ -25,10 +26,11 @@ def has_own_vectorization(spec: EnvSpec, of_this_package: bool = False) -> bool:
 
 
 def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
-    """Make the vectorized environment that stands for these environments, with one monitor file.
+    """Make one batch of environments in place of single ones, with one monitor file.
 
-    They are as SB3's ``make_vec_env`` makes them. A ``DummyVecEnv`` if their own vectorization
-    cannot stand for them: if a wrapper is around them, or if it does not reset in the same step.
+    The single ones are as SB3's ``make_vec_env`` makes them. The result is a ``DummyVecEnv`` of
+    them if the batch would differ: if wrappers are around them, or if the batch does not reset an
+    environment in the step in which its episode ends.
 
     :param env_fns: What makes each environment; all are alike.
     :param kwargs: For ``DummyVecEnv``.
@@ -40,6 +42,7 @@ def make_native_vec_env(env_fns: list[EnvFn], **kwargs: Any) -> VecEnv:
 
 
 def _vectorize(sample: Monitor, num_envs: int) -> VecEnv | None:
+    """A batch of environments like the sample, or None if it would differ from single ones."""
     spec = sample.env.spec  # with the user's env_kwargs
     assert spec is not None
     if spec.additional_wrappers:
@@ -48,11 +51,7 @@ def _vectorize(sample: Monitor, num_envs: int) -> VecEnv | None:
     if vector_env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
         vector_env.close()
         return None
-    return _monitor(vector_env, sample)
-
-
-def _monitor(vector_env: VectorEnv[Any, Any, Any], sample: Monitor) -> VecEnv:
-    """Record episodes in the file that the sample would have written to."""
+    # Record episodes in the file that the sample would have written to.
     writer = sample.results_writer
     filename = None if writer is None else str(writer.file_handler.name)
     return VecMonitor(GymVectorVecEnv(vector_env), filename, sample.info_keywords)

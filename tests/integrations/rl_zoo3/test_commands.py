@@ -12,6 +12,8 @@ MULTIGOAL = ["--algo", "policyflow", "--env", "MultiGoal-v0"]
 QUICK = ["-params", "n_steps:2", "batch_size:2048", "n_epochs:1", "n_flow_steps:2"]
 TRAIN = ["-m", "rl_zoo3.train"]
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def trained(installed: Environment, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:

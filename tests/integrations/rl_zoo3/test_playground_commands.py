@@ -8,6 +8,8 @@ from installation import Environment
 
 pytest.importorskip("mujoco_playground", reason="playground is not installed")
 
+pytestmark = pytest.mark.slow
+
 ENV_ID = "Playground/CartpoleBalance-v0"
 TRAIN = ["-m", "rl_zoo3.train", "--algo", "policyflow"]
 QUICK = ["-params", "n_envs:32", "n_steps:8", "batch_size:128", "n_epochs:1"]

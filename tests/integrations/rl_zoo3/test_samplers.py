@@ -8,9 +8,14 @@ from optuna.trial import FixedTrial
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.integrations.rl_zoo3.registration import ALGORITHMS
+from sb3_policyflow.algorithms import ALGORITHMS
+from sb3_policyflow.integrations.rl_zoo3.samplers import SAMPLERS, convert_flow_params
 
 N_ENVS = [1, 3, 8, 24, 32, 1000, 1024, 4096]
+
+
+def test_every_algorithm_has_a_search_space() -> None:
+    assert SAMPLERS.keys() == ALGORITHMS.keys()
 
 
 @pytest.fixture(params=ALGORITHMS)
@@ -22,7 +27,7 @@ def draws(algo: str, n_envs: int, number: int) -> list[tuple[optuna.Trial, dict[
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=RandomSampler(seed=n_envs))
     trials = [study.ask() for _ in range(number)]
-    return [(trial, ALGORITHMS[algo].sample(trial, 2, n_envs, {})) for trial in trials]
+    return [(trial, SAMPLERS[algo](trial, 2, n_envs, {})) for trial in trials]
 
 
 @pytest.mark.parametrize("n_envs", N_ENVS)
@@ -38,23 +43,24 @@ def test_sizes_fit_the_environments(algo: str, n_envs: int) -> None:
 @pytest.mark.parametrize("n_envs", [1, 24, 1024])
 def test_raw_values_make_the_same_hyperparameters_again(algo: str, n_envs: int) -> None:
     for trial, hyperparams in draws(algo, n_envs, 20):
-        again = ALGORITHMS[algo].convert(trial.params)
+        again = convert_flow_params(trial.params)
         assert again.pop("n_envs") == n_envs
         assert again == hyperparams
-        assert hyperparams == ALGORITHMS[algo].sample(FixedTrial(trial.params), 2, n_envs, {})
+        assert hyperparams == SAMPLERS[algo](FixedTrial(trial.params), 2, n_envs, {})
         for name, value in trial.user_attrs.items():
             assert hyperparams[name] == value
 
 
+@pytest.mark.slow
 def test_whatever_is_drawn_can_be_constructed_and_learns(algo: str) -> None:
     """All of it but the long rollouts and many epochs, which are a matter of patience."""
     env = make_vec_env("Pendulum-v1", n_envs=4)
     for _, hyperparams in draws(algo, 4, 20):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            ALGORITHMS[algo].algorithm(env=env, policy="MlpPolicy", **hyperparams)  # type: ignore[call-arg]
+            ALGORITHMS[algo](env=env, policy="MlpPolicy", **hyperparams)  # type: ignore[call-arg]
         short = {**hyperparams, "n_steps": 8, "batch_size": 16, "n_epochs": 2}
-        ALGORITHMS[algo].algorithm(env=env, policy="MlpPolicy", **short).learn(64)  # type: ignore[call-arg]
+        ALGORITHMS[algo](env=env, policy="MlpPolicy", **short).learn(64)  # type: ignore[call-arg]
 
 
 def test_every_choice_is_drawn_and_reaches_the_policy() -> None:

@@ -9,6 +9,8 @@ from installation import REPOSITORY, Environment, build
 ALGORITHMS = "import rl_zoo3.utils; print('policyflow' in rl_zoo3.utils.ALGOS)"
 FINDERS = "import sys; print([type(f).__name__ for f in sys.meta_path].count('ZooFinder'))"
 
+pytestmark = pytest.mark.slow
+
 
 def packages(environment: Environment) -> list[str]:
     """The folders of an environment's packages, for an interpreter that does not look for them."""

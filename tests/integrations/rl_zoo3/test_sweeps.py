@@ -32,6 +32,8 @@ ENDLESS = {**CHEAP, "rollout_pow": 15, "n_minibatches_pow": 6, "n_epochs": 20, "
 WORKER = ["-m", "rl_zoo3.train", "--algo", "policyflow", "--env", "Pendulum-v1"]
 SWEEP = [*WORKER, "--optimize", "-n", "1024", "--eval-episodes", "1", "--no-optim-plots"]
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def postgresql() -> Iterator[str]:

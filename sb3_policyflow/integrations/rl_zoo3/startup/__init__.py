@@ -1,4 +1,4 @@
-"""What the wheel puts beside this package, so that Python runs it at its start: docs/zoo.md."""
+"""What the wheel installs beside this package, for Python to run when it starts: docs/zoo.md."""
 
 import importlib
 import importlib.util
@@ -9,6 +9,6 @@ _IS_INSTALLED = importlib.util.find_spec(_NAME) is not None
 
 def install() -> None:
     """Put the finder in place, for interpreters that read no .pth files."""
-    # A checkout that is not installed has the module in this folder only.
+    # In a checkout that is not installed, the module is in this folder only.
     module = importlib.import_module(_NAME if _IS_INSTALLED else f"{__name__}.{_NAME}")
     module.install()

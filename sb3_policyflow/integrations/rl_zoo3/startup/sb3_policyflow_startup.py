@@ -1,8 +1,8 @@
 """Lets rl_zoo3 find the algorithms of sb3_policyflow; docs/zoo.md explains it.
 
-``sb3_policyflow.pth`` runs this at interpreter start: it imports nothing that is not loaded by
-then, and only puts a finder on ``sys.meta_path``. SB3_POLICYFLOW_ZOO=0 in the environment turns
-it off.
+``sb3_policyflow.pth`` runs this when the interpreter starts. It imports only modules that are
+loaded by then, and puts a finder on ``sys.meta_path``. SB3_POLICYFLOW_ZOO=0 in the environment
+turns it off.
 """
 
 import os
@@ -19,7 +19,7 @@ WATCHED = ("rl_zoo3.utils", "rl_zoo3.hyperparams_opt", "rl_zoo3.exp_manager")
 
 
 class ZooFinder:
-    """Finds nothing by itself: has the others find a watched module and registers after it ran."""
+    """Lets the other finders find a watched module, and registers after it has been executed."""
 
     def __init__(self) -> None:
         self._searching: set[str] = set()
@@ -27,7 +27,7 @@ class ZooFinder:
     def find_spec(
         self, name: str, path: "Sequence[str] | None" = None, target: "ModuleType | None" = None
     ) -> "ModuleSpec | None":
-        # The second condition: other packages' finders may ask all finders too, this one included.
+        # Other packages' finders may ask all finders too, this one included: do not search twice.
         if name not in WATCHED or name in self._searching:
             return None
         self._searching.add(name)
@@ -51,10 +51,10 @@ class ZooFinder:
 
 
 def install() -> None:
-    """Put the finder in place, once, and register with what is loaded of rl_zoo3 already."""
+    """Put the finder in place, once, and register with modules of rl_zoo3 that are loaded."""
     if os.environ.get("SB3_POLICYFLOW_ZOO") == "0":
         return
-    # There are two copies of this module, in the package and beside it, but one finder is enough.
+    # This module is in the package and beside it: compare names, so that one finder is installed.
     if not any(type(finder).__name__ == ZooFinder.__name__ for finder in sys.meta_path):
         sys.meta_path.insert(0, ZooFinder())
     for name in WATCHED:
@@ -84,7 +84,7 @@ def _register_after(spec: "ModuleSpec", name: str) -> None:
 
 
 def _register(name: str) -> None:
-    """Register with a module of rl_zoo3; whatever goes wrong is said, and stays in here."""
+    """Register with a module of rl_zoo3; an error becomes a warning, so that rl_zoo3 works."""
     try:
         from sb3_policyflow.integrations.rl_zoo3.registration import register
 

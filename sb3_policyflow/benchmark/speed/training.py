@@ -6,8 +6,6 @@ figures to report, let nothing else run on the machine.
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -17,13 +15,15 @@ from typing import Any
 
 import torch as th
 
-from sb3_policyflow.benchmark.costs import versions
-from sb3_policyflow.benchmark.speed_settings import GROWTH, MAIN, halfcheetah, isaaclab
-from sb3_policyflow.benchmark.table import markdown_table
-from sb3_policyflow.benchmark.timing import PARTS, peak_memory, time_calls, time_setting
+from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.benchmark.measure.provenance import machine
+from sb3_policyflow.benchmark.report.markdown import markdown_table
+from sb3_policyflow.benchmark.speed.settings import GROWTH, MAIN, halfcheetah, isaaclab
+from sb3_policyflow.benchmark.speed.timing import PARTS, peak_memory, time_calls, time_setting
 
 EMBEDDINGS = (64, 256, 512)
 CHOICES = (*MAIN, "predict", "memory", "growth", "isaaclab")
+DEFAULT = (*MAIN, "predict", "memory")
 
 
 def predict_times(repetitions: int) -> dict[str, Any]:
@@ -42,7 +42,8 @@ def predict_times(repetitions: int) -> dict[str, Any]:
 
 def memory_of(name: str, maker: str) -> float:
     """Peak memory in MiB of two iterations, in a process of their own."""
-    command = [sys.executable, "-m", __spec__.name, "--memory-of", name, maker]
+    command = [sys.executable, "-m", "sb3_policyflow.benchmark", "speed"]
+    command += ["--memory-of", name, maker]
     output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     return float(output.split()[-1])
 
@@ -66,25 +67,6 @@ def growth_figures(repetitions: int) -> dict[str, list[dict[str, Any]]]:
         what: [{"value": n, **time_setting(make(n), repetitions)} for n in values]
         for what, (make, values) in GROWTH.items()
     }
-
-
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "torch_threads": th.get_num_threads(),
-        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
-        "system": platform.platform(),
-        **versions(),
-    }
-
-
-def _processor() -> str:
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 # Tables
@@ -153,36 +135,32 @@ def measure(what: str, repetitions: int, device: str) -> tuple[Any, str]:
     return result, iterations_table([result])
 
 
-def main(argv: list[str]) -> int:
-    """Measure, write tables to the terminal and figures to a file."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark speed", description=__doc__
-    )
-    default = [*MAIN, "predict", "memory"]
-    parser.add_argument("what", nargs="*", help=f"of {', '.join(CHOICES)}; default: {default}")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    choices, default = ", ".join(CHOICES), ", ".join(DEFAULT)
+    parser.add_argument("what", nargs="*", help=f"of {choices}; default: {default}")
     parser.add_argument("--repetitions", type=int, default=5, help="default: 5")
     parser.add_argument("--threads", type=int, help="torch's threads; default: torch's own")
     parser.add_argument("--device", default="auto", help='of "isaaclab"; default: a GPU if any')
     parser.add_argument("--out", type=Path, help="a JSON file for all figures")
     parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
-    arguments = parser.parse_args(argv)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Measure, write tables to the terminal and figures to a file."""
     unknown = set(arguments.what) - set(CHOICES)
     if unknown:
-        parser.error(f"cannot measure {sorted(unknown)}: choose of {', '.join(CHOICES)}")
+        raise BenchmarkError(f"Cannot measure {sorted(unknown)}: choose from {', '.join(CHOICES)}.")
     if arguments.threads is not None:
         th.set_num_threads(arguments.threads)
     if arguments.memory_of:
-        sys.stdout.write(f"{measure_memory(*arguments.memory_of)}\n")
+        print(measure_memory(*arguments.memory_of))
         return 0
     figures: dict[str, Any] = {"machine": machine()}
-    for what in arguments.what or default:
+    for what in arguments.what or DEFAULT:
         figures[what], table = measure(what, arguments.repetitions, arguments.device)
-        sys.stdout.write(f"{table}\n\n")
-        sys.stdout.flush()
+        print(f"{table}\n", flush=True)
     if arguments.out is not None:
         arguments.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        print(f"Wrote {arguments.out}.")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

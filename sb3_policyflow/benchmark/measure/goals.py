@@ -5,18 +5,17 @@ its options reaches each with probability 1/6. The paper shows this as a picture
 trajectories; here it is also a number, the normalized entropy over goals.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
-import torch as th
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_policyflow.benchmark.measure.entropy import normalized_entropy
+from sb3_policyflow.benchmark.measure.seeding import seeded
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.envs.multigoal.point_masses import (
     GOALS,
@@ -25,7 +24,6 @@ from sb3_policyflow.envs.multigoal.point_masses import (
     nearest_goal,
 )
 
-FloatArray = NDArray[np.float64]
 CENTER = (0.0, 0.0)
 
 
@@ -33,25 +31,25 @@ CENTER = (0.0, 0.0)
 class Trajectories:
     """One episode a row.
 
-    :param positions: the episodes' positions, start included, NaN after an episode's end; shape
-        ``(n, MAX_EPISODE_STEPS + 1, 2)``
-    :param lengths: the episodes' numbers of steps, shape ``(n,)``
-    :param returns: the episodes' sums of rewards, shape ``(n,)``
+    :param positions: The episodes' positions, start included, NaN after an episode's end; shape
+        ``(n, MAX_EPISODE_STEPS + 1, 2)``.
+    :param lengths: The episodes' numbers of steps, shape ``(n,)``.
+    :param returns: The episodes' sums of rewards, shape ``(n,)``.
     """
 
-    positions: FloatArray
+    positions: NDArray[np.float64]
     lengths: NDArray[np.int_]
-    returns: FloatArray
+    returns: NDArray[np.float64]
 
-    def ends(self) -> FloatArray:
+    def ends(self) -> NDArray[np.float64]:
         """Where each episode ended, shape ``(n, 2)``."""
-        ends: FloatArray = self.positions[np.arange(len(self.lengths)), self.lengths]
+        ends: NDArray[np.float64] = self.positions[np.arange(len(self.lengths)), self.lengths]
         return ends
 
     def goals(self, radius: float = SUCCESS_RADIUS) -> NDArray[np.int_]:
         """Index of the goal within ``radius`` of each episode's end, -1 for none; shape ``(n,)``.
 
-        :raises ValueError: for a radius that two goals could share (or that is not positive)
+        :raises ValueError: For a radius that two goals could share (or that is not positive).
         """
         if not 0.0 < radius < 2.5:
             raise ValueError(
@@ -65,11 +63,11 @@ class Trajectories:
 class GoalReport:
     """What ``n`` episodes from the center came to.
 
-    :param counts: episodes that ended at each goal
-    :param n_missed: episodes that ended at none
-    :param entropy: ``normalized_entropy(counts)``
-    :param mean_return: mean sum of rewards (from the center: not the training return, whose starts
-        are spread over the workspace)
+    :param counts: Episodes that ended at each goal.
+    :param n_missed: Episodes that ended at none.
+    :param entropy: ``normalized_entropy(counts)``.
+    :param mean_return: Mean sum of rewards (from the center: not the training return, whose starts
+        are spread over the workspace).
     """
 
     counts: tuple[int, ...]
@@ -103,11 +101,11 @@ def sample_trajectories(
 
     If the model was trained under ``VecNormalize``, it sees observations normalized the same way.
 
-    :param model: any SB3 algorithm, or another object with its ``predict``
-    :param n: number of episodes
-    :param deterministic: passed to ``predict``; a deterministic policy has one trajectory only
-    :param seed: makes the policy's draws repeatable without touching the caller's generators;
-        ``None`` to go on from wherever they are
+    :param model: Any SB3 algorithm, or another object with its ``predict``.
+    :param n: Number of episodes.
+    :param deterministic: Passed to ``predict``; a deterministic policy has one trajectory only.
+    :param seed: Makes the policy's draws repeatable without touching the caller's generators;
+        ``None`` to go on from wherever they are.
     """
     env = MultiGoalVecEnv(n, seed=seed)
     env.set_options({"position": CENTER})
@@ -119,7 +117,8 @@ def sample_trajectories(
         )[0]
         return actions
 
-    with seeded(seed):
+    device = getattr(model, "device", "cpu")
+    with nullcontext() if seed is None else seeded(seed, device):
         return _run_episodes(env, act)
 
 
@@ -152,44 +151,10 @@ def _normalizer(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArr
     return lambda observations: np.asarray(vec_normalize.normalize_obs(observations))
 
 
-@contextmanager
-def seeded(seed: int | None) -> Iterator[None]:
-    """Draw repeatably within the block, and go on behind it as if nothing had been drawn.
-
-    :param seed: ``None`` to draw from the caller's generators as they are
-    """
-    if seed is None:
-        yield
-        return
-    numpy_state = np.random.get_state()
-    with th.random.fork_rng():
-        th.manual_seed(seed)
-        np.random.seed(seed)
-        try:
-            yield
-        finally:
-            np.random.set_state(numpy_state)
-
-
 def goal_counts(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> NDArray[np.int_]:
     """How many episodes ended within ``radius`` of each goal, shape ``(6,)``."""
     goals = trajectories.goals(radius)
     return np.bincount(goals[goals >= 0], minlength=len(GOALS))
-
-
-def normalized_entropy(counts: ArrayLike) -> float:
-    r"""Entropy of the shares over its greatest value, ``-sum p log p / log n``; 0 if all are 0.
-
-    >>> round(normalized_entropy([70, 72, 280, 136, 127, 87]), 2)
-    0.92
-
-    :param counts: non-negative numbers, at least two
-    """
-    array = np.asarray(counts, dtype=np.float64)
-    if array.ndim != 1 or len(array) < 2 or not (array >= 0).all():
-        raise ValueError(f"Entropy needs two or more counts, none negative, not {counts!r}.")
-    shares = array[array > 0] / array.sum() if array.any() else np.ones(1)
-    return float(abs(np.sum(shares * np.log(shares))) / np.log(len(array)))
 
 
 def goal_report(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> GoalReport:

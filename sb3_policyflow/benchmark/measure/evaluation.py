@@ -11,28 +11,29 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_policyflow.benchmark.goals import seeded
-from sb3_policyflow.common.policies import FlowActorCriticPolicy
+from sb3_policyflow.benchmark.measure.seeding import seeded
+from sb3_policyflow.common.policies import FlowPolicy
 
 EVALUATION_SEED = 1_000_000
 """Far from the seeds of trainings; every evaluation starts from the same states."""
 
 STOCHASTIC, LATENT_ONLY, DETERMINISTIC = "stochastic", "latent-only", "deterministic"
+MODES = (STOCHASTIC, LATENT_ONLY, DETERMINISTIC)
 
 
 def modes(model: BaseAlgorithm) -> tuple[str, ...]:
     """How a model can act: with all its randomness, with that of its latents only, with none."""
-    if isinstance(model.policy, FlowActorCriticPolicy):
+    if isinstance(model.policy, FlowPolicy):
         return STOCHASTIC, LATENT_ONLY, DETERMINISTIC
     return STOCHASTIC, DETERMINISTIC
 
 
 @contextmanager
-def _latents_drawn(model: BaseAlgorithm, mode: str) -> Iterator[None]:
+def _random_latents_enabled(model: BaseAlgorithm, mode: str) -> Iterator[None]:
     if mode != LATENT_ONLY:
         yield
         return
-    assert isinstance(model.policy, FlowActorCriticPolicy)
+    assert isinstance(model.policy, FlowPolicy)
     before, model.policy.random_latents = model.policy.random_latents, True
     try:
         yield
@@ -49,7 +50,7 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, mode: str, n_episodes: int) -> d
     if training_env is not None:
         sync_envs_normalization(training_env, env)
     env.seed(EVALUATION_SEED)
-    with seeded(EVALUATION_SEED), _latents_drawn(model, mode):
+    with seeded(EVALUATION_SEED, model.device), _random_latents_enabled(model, mode):
         returns, lengths = evaluate_policy(
             model,
             env,

@@ -17,14 +17,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import Error
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_policyflow.benchmark.results import ResultsError
-from sb3_policyflow.benchmark.speed import machine
-from sb3_policyflow.benchmark.table import markdown_table
-from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS, ensure_registered
+from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.measure.provenance import machine
+from sb3_policyflow.benchmark.report.markdown import markdown_table
+from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS
 from sb3_policyflow.integrations.rl_zoo3.vec_env import has_own_vectorization, make_native_vec_env
 
 DEFAULT_IDS = tuple(f"{PLAYGROUND}{task}-v0" for task in PLAYGROUND_TASKS)
@@ -36,13 +35,13 @@ N_ROUNDS = 5
 class Timing:
     """How fast one environment is.
 
-    :param env_id: its id
-    :param num_envs: how many were stepped at once
-    :param steps_per_second: environment steps in a second: the median over the rounds
-    :param rounds: environment steps in a second of each round
-    :param steps_per_cpu_second: environment steps in a second of processor time, of all cores
-    :param first_seconds: what the first reset and the first step took, compilation included
-    :param reset_seconds: what a later reset of all environments took
+    :param env_id: Its id.
+    :param num_envs: How many were stepped at once.
+    :param steps_per_second: Environment steps in a second: the median over the rounds.
+    :param rounds: Environment steps in a second of each round.
+    :param steps_per_cpu_second: Environment steps in a second of processor time, of all cores.
+    :param first_seconds: What the first reset and the first step took, compilation included.
+    :param reset_seconds: What a later reset of all environments took.
     """
 
     env_id: str
@@ -57,10 +56,10 @@ class Timing:
 def time_environment(env_id: str, num_envs: int, seconds: float) -> Timing:
     """Time one environment.
 
-    :param seconds: how long to step it for
-    :raises gymnasium.error.Error: if it cannot be made
+    :param seconds: How long to step it for.
+    :raises BenchmarkError: If there is no such environment, or the extra that it needs is missing.
     """
-    ensure_registered(env_id)
+    require_env(env_id)
     is_native = has_own_vectorization(gym.spec(env_id))
     vec_env_cls: Any = make_native_vec_env if is_native else DummyVecEnv
     env = make_vec_env(env_id, num_envs, seed=0, vec_env_cls=vec_env_cls)
@@ -123,26 +122,25 @@ def _rates(timing: Timing) -> str:
     return f"{timing.steps_per_second:,.0f} ({timing.steps_per_cpu_second:,.0f})"
 
 
-def main(argv: list[str]) -> int:
-    """Measure, write the table to the terminal and the figures to a file."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sb3_policyflow.benchmark environments", description=__doc__
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("ids", nargs="*", help="environments; default: the ten of Playground")
     parser.add_argument("--num-envs", type=int, nargs="+", default=DEFAULT_SIZES)
     parser.add_argument("--seconds", type=float, default=3.0, help="of steps each; default: 3")
     parser.add_argument("--out", type=Path, help="a JSON file for all figures")
-    arguments = parser.parse_args(argv)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Measure, write the table to the terminal and the figures to a file."""
     timings = []
     for env_id in arguments.ids or DEFAULT_IDS:
         for num_envs in arguments.num_envs:
-            try:
-                timings.append(time_environment(env_id, num_envs, arguments.seconds))
-            except Error as error:
-                raise ResultsError(str(error)) from error
-            sys.stderr.write(f"{env_id} {num_envs}: {timings[-1].steps_per_second:,.0f} steps/s\n")
-    sys.stdout.write(f"{speed_table(timings)}\n")
+            timings.append(time_environment(env_id, num_envs, arguments.seconds))
+            rate = timings[-1].steps_per_second
+            print(f"{env_id} {num_envs}: {rate:,.0f} steps/s", file=sys.stderr)
+    print(speed_table(timings))
     if arguments.out is not None:
         figures = {"machine": machine(), "timings": [asdict(timing) for timing in timings]}
         arguments.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        print(f"Wrote {arguments.out}.")
     return 0

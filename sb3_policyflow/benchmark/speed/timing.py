@@ -11,7 +11,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_policyflow.benchmark.speed_settings import Setting
+from sb3_policyflow.benchmark.speed.settings import Setting
 
 PARTS = ("environment", "sampling", "bootstrap", "other", "update")
 """What an iteration consists of: ``other`` is the rest of a rollout, buffer and loop."""

@@ -6,74 +6,73 @@ import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_policyflow.benchmark import costs
-from sb3_policyflow.benchmark.evaluation import EvaluationCallback
 from sb3_policyflow.benchmark.experiment import make_experiment
-from sb3_policyflow.benchmark.goals import goal_report, sample_trajectories
-from sb3_policyflow.benchmark.results import Cell, Result
-
-if TYPE_CHECKING:
-    from sb3_policyflow.benchmark.visits import VisitCounter
+from sb3_policyflow.benchmark.measure.costs import GradientSteps, network_evaluations
+from sb3_policyflow.benchmark.measure.evaluation import EvaluationCallback
+from sb3_policyflow.benchmark.measure.goals import goal_report, sample_trajectories
+from sb3_policyflow.benchmark.measure.provenance import versions
+from sb3_policyflow.benchmark.measure.visits import VisitCounter
+from sb3_policyflow.benchmark.results import Result, Run
 
 N_EVALUATION_ENVS = 10
 
 
-def train_cell(cell: Cell, folder: Path) -> Result:
+def train_one(run: Run, folder: Path) -> Result:
     """Train as ``python -m rl_zoo3.train`` does, evaluate, and write the results.
 
-    :param cell: What to train.
+    :param run: What to train.
     :param folder: Where the results go.
     """
     with tempfile.TemporaryDirectory() as logs:
-        manager = make_experiment(
-            cell.algo, cell.env, cell.steps, cell.seed, logs, cell.hyperparams
-        )
+        manager = make_experiment(run.algo, run.env, run.steps, run.seed, logs, run.hyperparams)
         setup = manager.setup_experiment()
         assert setup is not None
         model, hyperparams = setup
         assert isinstance(model, OnPolicyAlgorithm)
-        env = manager.create_envs(min(N_EVALUATION_ENVS, cell.n_episodes), eval_env=True)
-        evaluations = EvaluationCallback(env, _due(cell), cell.n_episodes)
-        counters = _visit_counters(cell)
+        env = manager.create_envs(min(N_EVALUATION_ENVS, run.n_episodes), eval_env=True)
+        due = np.linspace(0, run.steps, run.n_evaluations + 1)[1:].round().astype(int).tolist()
+        evaluations = EvaluationCallback(env, due, run.n_episodes)
+        # Only these need the extra ``robotics``.
+        counters = [VisitCounter()] if run.keep_visits else []
         callbacks = [*manager.callbacks, *counters]
         summary = {
             "hyperparams": {key: str(value) for key, value in hyperparams.items()},
-            **_train(model, cell.steps, evaluations, callbacks),
+            **train_and_measure(model, run.steps, evaluations, callbacks),
         }
         for counter in counters:
-            counter.visits().save(_archive(cell, folder))
-        if cell.n_trajectories:
-            summary["goals"] = _keep_trajectories(model, cell, folder)
+            counter.visits().save(_archive(run, folder))
+        if run.n_trajectories:
+            summary["goals"] = _keep_trajectories(model, run, folder)
         env.close()
         manager_env = model.get_env()
         assert manager_env is not None
         manager_env.close()
-    result = Result(cell, summary, evaluations.curve)
+    result = Result(run, summary, evaluations.curve)
     result.save(folder)
     return result
 
 
-def _due(cell: Cell) -> list[int]:
-    """When to evaluate."""
-    timesteps = np.linspace(0, cell.steps, cell.n_evaluations + 1)[1:]
-    return [round(value) for value in timesteps]
-
-
-def _train(
+def train_and_measure(
     model: OnPolicyAlgorithm,
     steps: int,
     evaluations: EvaluationCallback,
     callbacks: list[BaseCallback],
 ) -> dict[str, Any]:
-    """Train, and say what it came to and what it took."""
-    gradient_steps = costs.GradientSteps(model)
+    """Train, and say what it came to and what it took.
+
+    :param model: The model.
+    :param steps: Environment steps.
+    :param evaluations: Evaluates it meanwhile.
+    :param callbacks: More callbacks.
+    """
+    gradient_steps = GradientSteps(model)
     start = time.perf_counter()
     model.learn(
         _whole_rollouts(model, steps),
@@ -87,11 +86,11 @@ def _train(
         "final": final,
         "timesteps": model.num_timesteps,
         "gradient_steps": gradient_steps.count,
-        "network_evaluations": costs.network_evaluations(model, gradient_steps.count),
+        "network_evaluations": network_evaluations(model, gradient_steps.count),
         "parameters": sum(parameter.numel() for parameter in model.policy.parameters()),
         "seconds": {"training": seconds, "evaluation": evaluations.seconds},
         "threads": th.get_num_threads(),
-        "versions": costs.versions(),
+        "versions": versions(),
     }
 
 
@@ -105,28 +104,19 @@ def _whole_rollouts(model: OnPolicyAlgorithm, steps: int) -> int:
     return -(-steps // rollout) * rollout
 
 
-def _visit_counters(cell: Cell) -> list["VisitCounter"]:
-    """What counts visits, if they are to be kept; only this needs the extra ``robotics``."""
-    if not cell.keep_visits:
-        return []
-    from sb3_policyflow.benchmark.visits import VisitCounter
-
-    return [VisitCounter()]
-
-
-def _archive(cell: Cell, folder: Path) -> Path:
-    """Where arrays of a cell go; the folder is made."""
-    path = cell.path(folder, ".npz")
+def _archive(run: Run, folder: Path) -> Path:
+    """Where arrays of a run go; the folder is made."""
+    path = run.path(folder, ".npz")
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
-def _keep_trajectories(model: OnPolicyAlgorithm, cell: Cell, folder: Path) -> dict[str, Any]:
+def _keep_trajectories(model: OnPolicyAlgorithm, run: Run, folder: Path) -> dict[str, Any]:
     """Run episodes from the center of MultiGoal, keep them, and say which goals they reached."""
-    trajectories = sample_trajectories(model, cell.n_trajectories)
+    trajectories = sample_trajectories(model, run.n_trajectories)
     report = goal_report(trajectories)
     np.savez_compressed(
-        _archive(cell, folder),
+        _archive(run, folder),
         positions=trajectories.positions.astype(np.float16),
         lengths=trajectories.lengths.astype(np.int16),
         returns=trajectories.returns.astype(np.float32),
@@ -134,13 +124,15 @@ def _keep_trajectories(model: OnPolicyAlgorithm, cell: Cell, folder: Path) -> di
     return {**asdict(report), "n_goals": report.n_goals}
 
 
-def main(argv: list[str]) -> int:
-    """Train the cell that a JSON text describes."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_policyflow.benchmark cell")
-    parser.add_argument("cell", help="the cell's fields, as JSON")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("run", type=json.loads, help="the fields of a Run, as JSON")
     parser.add_argument("folder", type=Path, help="where the results go")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
-    arguments = parser.parse_args(argv)
+
+
+def main(arguments: argparse.Namespace) -> int:
+    """Train as ``run_all`` asks for it."""
     th.set_num_threads(arguments.threads)
-    train_cell(Cell(**json.loads(arguments.cell)), arguments.folder)
+    train_one(Run(**arguments.run), arguments.folder)
     return 0

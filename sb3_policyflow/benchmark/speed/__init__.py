@@ -1,0 +1,1 @@
+"""How long trainings and environments take."""
