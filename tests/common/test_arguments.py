@@ -39,12 +39,15 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
     ("options", "message"),
     [
         ({"use_sde": True}, r"use_sde=True is not supported: leave it out"),
-        ({"rollout_buffer_class": RolloutBuffer}, r"needs a rollout buffer that keeps.*derive"),
+        ({"rollout_buffer_class": RolloutBuffer}, r"needs a rollout buffer that stores.*derive"),
         ({"n_flow_steps": 0}, r"n_flow_steps must be at least 1"),
         ({"n_flow_steps": None}, r"n_flow_steps must be at least 1, and a whole number, got None"),
-        ({"path": "straight"}, r"Unknown path 'straight': choose one of 'rectified', 'stochastic'"),
-        ({"solver": "dopri5"}, r"Unknown solver 'dopri5': choose one of 'euler', 'midpoint'"),
-        ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'starts', 'uniform'"),
+        (
+            {"interpolant": "straight"},
+            r"interpolant must be one of 'rectified', 'stochastic',.* got 'straight'",
+        ),
+        ({"solver": "dopri5"}, r"solver must be one of 'euler', .* got 'dopri5'"),
+        ({"time_sampler": "beta"}, r"time_sampler must be one of 'grid', 'grid_without_end'"),
         ({"n_times": 0}, r"n_times must be at least 1"),
         ({"time_average": "ratio"}, r"time_average must be one of 'objective', 'shift'"),
         ({"brownian_coef": -0.1}, r"brownian_coef must not be negative"),
@@ -53,10 +56,15 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"brownian_reduction": "max"}, r"brownian_reduction must be one of 'sum', 'mean'"),
         ({"desired_kl": 0.0}, r"desired_kl must be positive or None"),
         ({"desired_kl": 0.01, "learning_rate": LinearSchedule(1e-3, 0, 1)}, r"not a schedule"),
-        ({"lr_bounds": None}, r"lr_bounds must be two numbers in order, got None"),
-        ({"lr_bounds": (0.0, 1e-3)}, r"lr_bounds must be positive"),
-        ({"lr_factor": 0.5}, r"lr_factor must be greater than 1, got 0.5"),
-        ({"kl_margin": 0.5}, r"kl_margin must be a number from 1 to inf"),
+        (
+            {"lr_adaptation_kwargs": {"bounds": None}},
+            r"bounds must be two numbers in order, got None",
+        ),
+        ({"lr_adaptation_kwargs": {"bounds": (0.0, 1e-3)}}, r"bounds must be positive"),
+        ({"lr_adaptation_kwargs": {"factor": 0.5}}, r"factor must be greater than 1, got 0.5"),
+        ({"lr_adaptation_kwargs": {"margin": 0.5}}, r"margin must be a number from 1 to inf"),
+        ({"lr_adaptation_kwargs": {"speed": 2}}, r"lr_adaptation_kwargs must be a dictionary of"),
+        ({"lr_adaptation_kwargs": 1.5}, r"lr_adaptation_kwargs must be a dictionary of interval"),
         ({"max_grad_norm": float("nan")}, r"max_grad_norm must be a number"),
         ({"max_grad_norm": "a"}, r"max_grad_norm must be a number"),
         ({"target_kl": -1.0}, r"target_kl must be positive"),
@@ -71,15 +79,18 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"policy_kwargs": {"frequencies": 2.5}}, r"frequencies must be a list of numbers"),
         ({"policy_kwargs": {"latent_std": 0.0}}, r"latent_std must be positive, got 0.0"),
         (
-            {"policy_kwargs": {"latent_std": 0.5}, "path": "stochastic"},
-            r"leave out latent_std, or use path='rectified'",
+            {"policy_kwargs": {"latent_std": 0.5}, "interpolant": "stochastic"},
+            r"leave out latent_std, or use interpolant='rectified'",
         ),
         (
             {"policy_kwargs": {"latent_std": 0.5}, "gaussian": True},
             r"latents are 0: leave out latent_std",
         ),
-        ({"lr_adaptation": "step"}, r"lr_adaptation must be one of 'epoch', 'minibatch'"),
-        ({"kl_window": "all"}, r"kl_window must be one of 'epoch', 'update'"),
+        ({"lr_adaptation_kwargs": {"interval": "step"}}, r"interval must be one of 'epoch', 'mini"),
+        (
+            {"lr_adaptation_kwargs": {"window": "all"}},
+            r"In lr_adaptation_kwargs, window must be one",
+        ),
         ({"advantage_scope": "all"}, r"advantage_scope must be one of 'minibatch', 'rollout'"),
         ({"timeout_bootstrap": "yes"}, r"timeout_bootstrap must be one of 'terminal', 'current'"),
         ({"learning_rate": -1e-3}, r"learning_rate must be a number from 0.0 to inf, got -0.001"),
@@ -91,9 +102,12 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"n_steps": 0}, r"n_steps must be at least 1"),
         ({"n_epochs": 0}, r"n_epochs must be at least 1"),
         ({"clip_range_vf": -0.2}, r"clip_range_vf must be positive, or None"),
-        ({"policy_kwargs": {"initialization": "he"}}, r"Unknown initialization 'he'"),
+        ({"policy_kwargs": {"initialization": "he"}}, r"initialization must be one of .* got 'he'"),
         ({"policy_kwargs": {"embedding_dim": 0}}, r"embedding_dim must be at least 1"),
-        ({"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to PolicyFlow itself"),
+        (
+            {"policy_kwargs": {"solver": "rk4"}, "solver": "heun"},
+            r"Give \['solver'\] to PolicyFlow or",
+        ),
     ],
     ids=str,
 )
@@ -105,8 +119,8 @@ def test_options_of_policyflow(options: dict[str, Any], message: str) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "options", "message"),
     [
-        (FPO, {"n_probes": 0}, "n_probes must be at least 1"),
-        (FPO, {"probe_average": "ratio"}, "probe_average must be one of 'loss', 'objective'"),
+        (FPO, {"n_mc_samples": 0}, "n_mc_samples must be at least 1"),
+        (FPO, {"mc_average": "ratio"}, "mc_average must be one of 'loss', 'objective'"),
         (FPO, {"loss_target": "x0"}, "loss_target must be one of 'epsilon', 'velocity'"),
         (FPO, {"loss_reduction": "max"}, "loss_reduction must be one of 'mean', 'sum'"),
         (FPO, {"time_sampler": "beta"}, "time_sampler must be one of"),
@@ -114,12 +128,16 @@ def test_options_of_policyflow(options: dict[str, Any], message: str) -> None:
         (FPO, {"loss_clamp": 0.0}, "loss_clamp must be positive, or None"),
         (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, or None"),
         (FPO, {"action_noise_std": -0.1}, "action_noise_std must be a number from 0"),
-        (FPO, {"solver": "newton"}, "Unknown solver 'newton'"),
+        (FPO, {"solver": "newton"}, "solver must be one of .* got 'newton'"),
         (FPO, {"n_flow_steps": 0}, "n_flow_steps must be at least 1"),
         (FPO, {"n_flow_steps": 2.5}, "and a whole number, got 2.5"),
         (FPO, {"ent_coef": -1.0}, "ent_coef must not be negative"),
         (FPO, {"n_entropy_actions": 1}, "n_entropy_actions must be at least 2"),
-        (FPO, {"policy_kwargs": {"solver": "rk4"}}, r"Give \['solver'\] to FPO itself"),
+        (
+            FPO,
+            {"policy_kwargs": {"solver": "rk4"}, "solver": "heun"},
+            "or in policy_kwargs, not to both",
+        ),
         (DPPO, {"process": "vp"}, "process must be one of 'ddpm', 'flow'"),
         (DPPO, {"n_denoising_steps": 0}, "n_denoising_steps must be at least 1"),
         (DPPO, {"n_finetuned_steps": 11}, "some of the n_denoising_steps=10, got 11"),
@@ -151,7 +169,9 @@ def test_options_that_do_not_exist_are_not_swallowed() -> None:
 
 
 def test_policies_of_another_kind() -> None:
-    with pytest.raises(ValueError, match=r"derived from FlowPolicy, not ActorCriticPolicy: use"):
+    with pytest.raises(
+        ValueError, match=r"derived from PolicyFlowPolicy, not ActorCriticPolicy: use"
+    ):
         PolicyFlow(ActorCriticPolicy, "Pendulum-v1")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="GaussianPolicy"):
         PolicyFlow("GaussianPolicy", "Pendulum-v1")

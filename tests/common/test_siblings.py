@@ -19,7 +19,7 @@ from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from tests.helpers import SMALL, TINY, TWO_EPOCHS, train, weights
 
 FPO_PLUS_PLUS: dict[str, Any] = {
-    "probe_average": "objective",
+    "mc_average": "objective",
     "loss_target": "velocity",
     "loss_reduction": "sum",
     "trust_region": "aspo",
@@ -36,7 +36,7 @@ FLOW_CHAIN: dict[str, Any] = {
 }
 TRIGFLOW: dict[str, Any] = {
     "brownian_coef": "lin_0.25_0.05",
-    "path": "trigflow",
+    "interpolant": "trigflow",
     "n_flow_steps": 4,
     "solver": "rk4",
     "policy_kwargs": {"embedding_dim": 8, "log_std_bounds": (-5.0, 2.0), "latent_std": 0.5},

@@ -11,13 +11,14 @@ from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.flows import PATHS, Rectified, StochasticInterpolant, VelocityField
+from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from sb3_policyflow.policyflow.uniform import UniformTargets
 
 GAUSSIAN: dict[str, Any] = {
     "gaussian": True,
     "n_flow_steps": 1,
     "solver": "euler",
-    "time_sampler": "starts",
+    "time_sampler": "grid_without_end",
 }
 
 
@@ -26,7 +27,7 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
     model = PolicyFlow("MlpPolicy", "Pendulum-v1", n_steps=64, seed=0, ent_coef=0.01, **GAUSSIAN)
     policy = model.policy
     model.learn(64)
-    rollout = model._rollout()
+    rollout = model.rollout_buffer.samples()
     features = policy.actor_features(rollout.observations)
     zeros = th.zeros(64, 1)
 
@@ -40,11 +41,11 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
         actions, record = policy.sample_actions(features)
         old = gaussian()
         rollout = rollout._replace(actions=actions, record=record)
-        behavior = model._behavior(rollout)
-        probes = model._draw_probes(rollout, behavior)
+        update = PolicyFlowUpdate(model, rollout)
+        rollout = rollout._replace(drawn=update.draw(rollout))
         for parameter in policy.parameters():
             parameter += 0.05 * th.randn_like(parameter)
-        terms = model._policy_terms(rollout._replace(probes=probes), features, behavior)
+        terms = update.terms(rollout, features)
         new = gaussian()
     assert th.equal(record.latents, zeros)
     th.testing.assert_close(record.endpoints, old.mean)
@@ -103,8 +104,10 @@ def test_uniform_noise_is_added_to_the_loss_and_logged() -> None:
     assert model.logger.name_to_value["train/uniform_noise_loss"] > 0
 
 
-def test_uniform_noise_needs_a_path_without_noise() -> None:
-    with pytest.raises(ValueError, match="path without noise of its own"):
+def test_uniform_noise_needs_an_interpolant_without_noise() -> None:
+    with pytest.raises(ValueError, match="interpolant without noise of its own"):
         UniformTargets(spaces.Box(-1, 1, (1,)), StochasticInterpolant())
-    with pytest.raises(ValueError, match="path without noise of its own"):
-        PolicyFlow("MlpPolicy", gym.make("Pendulum-v1"), path="stochastic", uniform_noise_coef=0.1)
+    with pytest.raises(ValueError, match="interpolant without noise of its own"):
+        PolicyFlow(
+            "MlpPolicy", gym.make("Pendulum-v1"), interpolant="stochastic", uniform_noise_coef=0.1
+        )

@@ -112,7 +112,7 @@ def test_deterministic_actions_are_where_the_zero_latent_ends() -> None:
     deterministic, _ = model.predict(obs, deterministic=True)
     with th.no_grad():
         features = model.policy.actor_features(th.as_tensor(obs))
-        endpoints = model.policy.carry(th.zeros(5, 1), features)
+        endpoints = model.policy.transport(th.zeros(5, 1), features)
     np.testing.assert_allclose(deterministic, endpoints.numpy().clip(-2, 2), rtol=1e-5)
 
 
@@ -137,7 +137,7 @@ def test_policy_alone_can_be_saved(tmp_path: Path) -> None:
     model = PolicyFlow(
         "MlpPolicy",
         "Pendulum-v1",
-        path="trigflow",
+        interpolant="trigflow",
         n_flow_steps=3,
         solver="heun",
         policy_kwargs=policy_kwargs,
@@ -195,7 +195,9 @@ def test_learning_rate_follows_the_divergence() -> None:
     falling = rates(desired_kl=1e-7)
     assert falling[0] == 3e-4
     assert falling[1] == pytest.approx(3e-4 / 1.5**10)  # ten epochs
-    rising = rates(desired_kl=10.0, lr_adaptation="minibatch", lr_bounds=(1e-6, 5e-4))
+    rising = rates(
+        desired_kl=10.0, lr_adaptation_kwargs={"interval": "minibatch", "bounds": (1e-6, 5e-4)}
+    )
     assert rising[1] == 5e-4
 
 
@@ -206,7 +208,7 @@ def test_divergence_to_follow_may_change() -> None:
         n_steps=256,
         seed=0,
         desired_kl=lambda remaining: 10.0 if remaining > 0.4 else 1e-7,
-        lr_bounds=(1e-6, 5e-4),
+        lr_adaptation_kwargs={"bounds": (1e-6, 5e-4)},
     )
     model.learn(512)  # up to the bound, then down after each of ten epochs
     assert model.adaptive_learning_rate == pytest.approx(5e-4 / 1.5**10)
@@ -220,8 +222,8 @@ def test_target_kl_stops_the_update() -> None:
     assert n_updates(whole) == 10
 
 
-@pytest.mark.parametrize("lr_adaptation", ["epoch", "minibatch"])
-def test_update_that_is_stopped_lowers_the_learning_rate(lr_adaptation: str) -> None:
+@pytest.mark.parametrize("interval", ["epoch", "minibatch"])
+def test_update_that_is_stopped_lowers_the_learning_rate(interval: str) -> None:
     model = PolicyFlow(
         "MlpPolicy",
         "Pendulum-v1",
@@ -229,7 +231,7 @@ def test_update_that_is_stopped_lowers_the_learning_rate(lr_adaptation: str) -> 
         learning_rate=1e-2,
         target_kl=1e-4,
         desired_kl=5e-5,
-        lr_adaptation=lr_adaptation,
+        lr_adaptation_kwargs={"interval": interval},
         seed=0,
     )
     model.learn(256)

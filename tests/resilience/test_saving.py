@@ -148,7 +148,10 @@ def test_going_on_in_the_middle_of_episodes(tmp_path: Path) -> None:
     loaded = PolicyFlow.load(tmp_path / "model", env=env, force_reset=False)
     np.testing.assert_array_equal(last_observations(loaded), observations)
     np.testing.assert_array_equal(env.returns, returns)
-    with pytest.raises(ValueError, match=r"saved with 2 environments and cannot go on .* with 3"):
+    with pytest.raises(
+        ValueError,
+        match=r"saved with 2 environments and cannot continue in the middle of .* with 3",
+    ):
         PolicyFlow.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 3), force_reset=False)
 
 
@@ -280,7 +283,7 @@ def test_archives_of_something_else(tmp_path: Path) -> None:
 
 def test_models_of_another_algorithm(tmp_path: Path) -> None:
     PPO("MlpPolicy", "Pendulum-v1").save(tmp_path / "ppo")
-    with pytest.raises(ValueError, match="trains policies derived from FlowPolicy"):
+    with pytest.raises(ValueError, match="trains policies derived from PolicyFlowPolicy"):
         PolicyFlow.load(tmp_path / "ppo")
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch as th
-from sb3_policyflow.common.metrics import UpdateMetrics
+from sb3_policyflow.common.update import UpdateMetrics
 
 
 def test_means_and_maxima_over_minibatches() -> None:
