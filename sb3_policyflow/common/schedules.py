@@ -105,6 +105,8 @@ class KLAdaptiveLearningRate:
         except TypeError as error:
             known = ", ".join(cls.__dataclass_fields__)
             raise ValueError(f"{name} must be a dictionary of {known}, got {options!r}.") from error
+        except ValueError as error:
+            raise ValueError(f"In {name}, {error}") from error
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
         """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""

@@ -19,15 +19,15 @@ from sb3_policyflow.kernels.inspection import (
 from sb3_policyflow.kernels.layouts import (
     FieldGradients,
     FieldLayout,
-    FirstLayerGradients,
+    FirstLayer,
     Floats,
     KernelInput,
     Kernels,
-    TimeLayers,
 )
 from sb3_policyflow.kernels.mlp import (
     MLP,
     Evaluation,
+    Gradients,
     any_needs_grad,
     differentiable_gradients,
     read_mlp,
@@ -154,50 +154,60 @@ class _Embedding:
 
     def __init__(self, parts: FieldParts, times: Floats, features: Floats) -> None:
         self._parts, self._features = parts, features
-        self._times = times.reshape(-1).copy()
+        distinct = times.reshape(-1).copy()
         n_times, size, width = times.size, parts.time.n_outputs, parts.network.widths[0]
-        self._saved = TimeLayers(*np.empty((3, n_times, size), dtype=np.float32))
-        table = np.empty((n_times, width), dtype=np.float32)
-        self.entries = np.empty(n_times, dtype=np.int64)
-        self.shifts = np.empty((len(features), width), dtype=np.float32)
-        n_distinct = parts.kernels.embed(
-            self._times,
-            self.entries,
-            features,
-            parts.layout(),
-            self._saved,
-            table,
-            self.shifts,
+        self._first = FirstLayer(
+            np.empty((n_times, width), dtype=np.float32),
+            np.empty(n_times, dtype=np.int64),
+            np.empty((len(features), width), dtype=np.float32),
+            *np.empty((3, n_times, size), dtype=np.float32),
         )
-        self._times, self.table = self._times[:n_distinct], table[:n_distinct]
+        n_distinct = parts.kernels.embed(distinct, features, parts.layout(), self._first)
+        self._times = distinct[:n_distinct]
 
-    def backward(self, first: FirstLayerGradients, grad_features: Floats) -> list[th.Tensor]:
+    def kernel_input(self, points: Floats, times_shape: th.Size, leading: th.Size) -> KernelInput:
+        """The first layer of a network that sees points, too.
+
+        :param points: shape (n, dim).
+        :param times_shape: The shape that the times have.
+        :param leading: The shape that the n points have, with which it broadcasts.
+        """
+        table, entries, shifts = self._first[:3]
+        if times_shape != leading:
+            entries = np.broadcast_to(entries.reshape(times_shape), leading).reshape(-1)
+        stride = self._parts.network.n_inputs
+        return KernelInput(points, stride, table[: len(self._times)], entries, shifts)
+
+    def backward(self, gradients: Gradients, grad_features: Floats) -> list[th.Tensor]:
         """Gradients of the parameters up to the first layer.
 
-        :param first: Those of the first layer's summands.
+        :param gradients: Those of the network.
         :param grad_features: Filled; shape (m, features_dim), or empty if it is not wanted.
         """
-        grads = [th.empty(tensor.shape) for tensor in self._parts.embedding]
-        gradients = FieldGradients(grad_features, *[grad.numpy() for grad in grads])
+        arrays = [np.empty(tensor.shape, dtype=np.float32) for tensor in self._parts.embedding]
         self._parts.kernels.embed_backward(
-            self._times, self._features, self._parts.layout(), self._saved, first, gradients
+            self._times,
+            self._features,
+            self._parts.layout(),
+            self._first,
+            FieldGradients(
+                gradients.points.numpy(),
+                gradients.table.numpy(),
+                gradients.shifts,
+                grad_features,
+                *arrays,
+            ),
         )
-        return grads
+        return [th.from_numpy(array) for array in arrays]
 
 
 def _evaluation(
     parts: FieldParts, times: th.Tensor, points: th.Tensor, features: th.Tensor
 ) -> tuple[_Embedding, Evaluation]:
-    flat_features = features.detach().reshape(-1, parts.features_dim)
-    embedding = _Embedding(parts, times.numpy(), flat_features.numpy())
-    entries = np.broadcast_to(embedding.entries.reshape(times.shape), points.shape[:-1])
-    first = KernelInput(
-        points.detach().reshape(-1, parts.dim).numpy(),
-        parts.network.n_inputs,
-        embedding.table,
-        entries.reshape(-1),
-        embedding.shifts,
-    )
+    flat_points = points.detach().view(-1, parts.dim).numpy()
+    flat_features = features.detach().view(-1, parts.features_dim).numpy()
+    embedding = _Embedding(parts, times.numpy(), flat_features)
+    first = embedding.kernel_input(flat_points, times.shape, points.shape[:-1])
     return embedding, Evaluation(parts.network, first)
 
 
@@ -241,11 +251,8 @@ class _FieldEvaluation(th.autograd.Function):
             grad_outputs.reshape(-1, parts.dim),
             grad_points.view(-1, parts.dim).numpy(),
         )
-        first = FirstLayerGradients(
-            gradients.points.numpy(), gradients.table.numpy(), gradients.shifts
-        )
         of_embedding = ctx.embedding.backward(
-            first, grad_features.view(-1, parts.features_dim).numpy()
+            gradients, grad_features.view(-1, parts.features_dim).numpy()
         )
         return (
             None,

@@ -168,12 +168,9 @@ def is_eager() -> bool:
     return not th.compiler.is_compiling() and th._C._get_tracing_state() is None
 
 
-def has_same_shapes(tensors: Iterable[th.Tensor], shapes: Iterable[th.Size]) -> bool:
+def has_same_shapes(tensors: Iterable[th.Tensor], shapes: list[th.Size]) -> bool:
     """Whether tensors have the shapes that they were read in."""
-    for tensor, shape in zip(tensors, shapes, strict=True):  # noqa: SIM110  # see is_current
-        if tensor.shape != shape:
-            return False
-    return True
+    return [tensor.shape for tensor in tensors] == shapes
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:

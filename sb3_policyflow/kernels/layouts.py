@@ -46,17 +46,6 @@ class MLPLayout(NamedTuple):
     alpha: float
 
 
-class SavedLayers(NamedTuple):
-    """What an MLP's backward pass needs: its activations and their derivatives, n * sum(widths).
-
-    They are flat, in the order in which blocks of rows are computed. Empty arrays if there will be
-    no backward pass.
-    """
-
-    values: Floats
-    derivatives: Floats
-
-
 class MLPGradients(NamedTuple):
     """Gradients that an MLP's backward pass adds to.
 
@@ -93,34 +82,33 @@ class FieldLayout(NamedTuple):
     first_bias: int
 
 
-class TimeLayers(NamedTuple):
-    """The time embedding's hidden layer, its derivatives, and the embeddings plus b_o.
+class FirstLayer(NamedTuple):
+    """What times and features contribute to a field's first layer of h outputs, and on the way.
 
-    Each has the shape (n_times, embedding_dim).
+    The ``table`` of distinct times (n_times, h); the ``entries`` of it for each time (n_times,);
+    the ``shifts`` of features (m, h). For the backward pass the time embedding's ``hidden`` layer,
+    its ``derivatives``, and the ``embeddings`` plus b_o, each (n_times, embedding_dim).
     """
 
+    table: Floats
+    entries: Integers
+    shifts: Floats
     hidden: Floats
     derivatives: Floats
     embeddings: Floats
 
 
-class FirstLayerGradients(NamedTuple):
-    """Gradients of the three summands of a first layer of h outputs.
+class FieldGradients(NamedTuple):
+    """Gradients of a field's first layer, and what follows from them.
 
-    ``points`` W^T (dim, h), ``table`` (n_times, h), ``shifts`` (m, h).
+    Given are those of the first layer's summands, of h outputs: ``points`` W^T (dim, h), ``table``
+    (n_times, h) and ``shifts`` (m, h). Filled are those of the ``features`` (m, n_features), which
+    may be empty, and of the parameters in :class:`FieldLayout`, of their shapes.
     """
 
     points: Floats
     table: Floats
     shifts: Floats
-
-
-class FieldGradients(NamedTuple):
-    """Gradients of the parameters in :class:`FieldLayout`, of their shapes.
-
-    And of the ``features`` (m, n_features), or empty if they are not wanted.
-    """
-
     features: Floats
     time_hidden_weight: Floats
     time_hidden_bias: Floats
@@ -173,7 +161,8 @@ class Kernels(Protocol):
         first: KernelInput,
         network: MLPLayout,
         outputs: Floats,
-        saved: SavedLayers,
+        values: Floats,
+        derivatives: Floats,
         start: int,
         stop: int,
     ) -> None:
@@ -183,7 +172,8 @@ class Kernels(Protocol):
         self,
         first: KernelInput,
         network: MLPLayout,
-        saved: SavedLayers,
+        values: Floats,
+        derivatives: Floats,
         grad_outputs: Floats,
         gradients: MLPGradients,
         start: int,
@@ -191,16 +181,7 @@ class Kernels(Protocol):
     ) -> None:
         """Add an MLP's gradients of some rows."""
 
-    def embed(
-        self,
-        times: Floats,
-        entries: Integers,
-        features: Floats,
-        field: FieldLayout,
-        saved: TimeLayers,
-        table: Floats,
-        shifts: Floats,
-    ) -> int:
+    def embed(self, times: Floats, features: Floats, field: FieldLayout, first: FirstLayer) -> int:
         """Evaluate what times and features contribute to a field's first layer."""
 
     def embed_backward(
@@ -208,8 +189,7 @@ class Kernels(Protocol):
         times: Floats,
         features: Floats,
         field: FieldLayout,
-        saved: TimeLayers,
-        first: FirstLayerGradients,
+        first: FirstLayer,
         gradients: FieldGradients,
     ) -> None:
         """Gradients of what :meth:`embed` takes."""

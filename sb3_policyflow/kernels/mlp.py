@@ -23,7 +23,6 @@ from sb3_policyflow.kernels.layouts import (
     Kernels,
     MLPGradients,
     MLPLayout,
-    SavedLayers,
 )
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
@@ -122,9 +121,11 @@ class Evaluation:
         # waiting for small ones.
         n_saved = n_rows * network.n_hidden if saves else 0
         saved = th.from_numpy(np.empty((2, n_saved), dtype=np.float32))
-        arguments = network.layout(network.tensors), outputs.numpy(), SavedLayers(*saved.numpy())
-        run = network.kernels.forward
-        self._in_parts(lambda _, start, stop: run(first, *arguments, start, stop))
+        layout, (values, derivatives) = network.layout(network.tensors), saved.numpy()
+        run, filled = network.kernels.forward, outputs.numpy()
+        self._in_parts(
+            lambda _, start, stop: run(first, layout, filled, values, derivatives, start, stop)
+        )
         return outputs, saved
 
     def backward(
@@ -147,12 +148,12 @@ class Evaluation:
         # Each thread adds up its own; rows that share a shift belong to one thread.
         flat = th.zeros(self._n_parts, sum(sizes))
         shifts, of_thread = np.zeros_like(first.shifts), flat.numpy()
-        layout, layers = network.layout(parameters), SavedLayers(*saved.numpy())
+        layout, (values, derivatives) = network.layout(parameters), saved.numpy()
         outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
 
         def run_part(part: int, start: int, stop: int) -> None:
             gradients = MLPGradients(of_thread[part], shifts, grad_points)
-            run(first, layout, layers, outputs, gradients, start, stop)
+            run(first, layout, values, derivatives, outputs, gradients, start, stop)
 
         self._in_parts(run_part)
         total = flat[0] if self._n_parts == 1 else flat.sum(0)

@@ -158,7 +158,7 @@ def test_a_missing_extra_is_named_before_a_training(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     assert main([command, "--out", str(tmp_path)]) == 2
-    assert f"needs {module}: pip install" in capsys.readouterr().err
+    assert f"needs {module}: run `pip install" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

@@ -13,7 +13,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
+from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.kernels.compiler import SWITCH, load_kernels
+from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from tests.kernels.plain import Critic, make_field
 from tests.resilience.test_collection import Clock
 
@@ -35,7 +37,7 @@ def train(algorithm: Any, **options: Any) -> th.Tensor:
         (PolicyFlow, {"policy_kwargs": MISH}),
         (PolicyFlow, {"policy_kwargs": MISH, "brownian_coef": 0.25, "ent_coef": 0.01}),
         (PolicyFlow, {"policy_kwargs": MISH, "time_sampler": "uniform", "n_times": 3}),
-        (PolicyFlow, {"policy_kwargs": MISH, "path": "trigflow", "clip_range_vf": 0.2}),
+        (PolicyFlow, {"policy_kwargs": MISH, "interpolant": "trigflow", "clip_range_vf": 0.2}),
         (PolicyFlow, {"policy_kwargs": {**MISH, "activation_fn": th.nn.GELU}}),
         (FPO, {"policy_kwargs": MISH}),
         (DPPO, {"policy_kwargs": MISH}),
@@ -57,7 +59,7 @@ class Picture(Clock):
         super().__init__(limit=5)
         self.observation_space = spaces.Box(0, 255, (36, 36, 3), np.uint8)
 
-    def _obs(self) -> Any:
+    def observation(self) -> Any:
         return np.full((36, 36, 3), 40 * self.time, dtype=np.uint8)
 
 
@@ -70,10 +72,14 @@ def test_features_extractors(policy: str, request: pytest.FixtureRequest) -> Non
         model = PolicyFlow(policy, env, n_steps=8, batch_size=16, seed=0, policy_kwargs=kwargs)
         model.learn(16)
         th.manual_seed(0)
-        rollout = model._rollout()
-        behavior = model._behavior(rollout)
-        rollout = rollout._replace(probes=model._draw_probes(rollout, behavior))
-        loss, _, _ = model._loss(rollout, behavior)
+        rollout = model.rollout_buffer.samples()
+        update = PolicyFlowUpdate(model, rollout)
+        rollout = rollout._replace(drawn=update.draw(rollout))
+        features, critic_features = model.policy.actor_critic_features(rollout.observations)
+        terms = update.terms(rollout, features)
+        loss = update.surrogate_loss(terms.log_ratio, rollout.advantages, UpdateMetrics())
+        values = model.policy.values(critic_features).flatten()
+        loss = loss + terms.regularizer + (values - rollout.returns).square().mean()
         return list(th.autograd.grad(loss, list(model.policy.parameters())))
 
     fused = gradients()

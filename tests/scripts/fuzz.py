@@ -95,15 +95,20 @@ common: dict[str, st.SearchStrategy[Any]] = {
     "max_grad_norm": st.sampled_from([None, 0.0, 0.5]),
     "target_kl": st.sampled_from([None, 1e-3]),
     "desired_kl": st.sampled_from([None, 0.01]),
-    "lr_adaptation": st.sampled_from(["epoch", "minibatch"]),
-    "kl_window": st.sampled_from(["epoch", "update"]),
+    "lr_adaptation_kwargs": st.fixed_dictionaries(
+        {},
+        optional={
+            "interval": st.sampled_from(["epoch", "minibatch"]),
+            "window": st.sampled_from(["epoch", "update"]),
+        },
+    ),
     "advantage_scope": st.sampled_from(["minibatch", "rollout"]),
     "timeout_bootstrap": st.sampled_from(["terminal", "current", "none"]),
 }
 ode: dict[str, st.SearchStrategy[Any]] = {
     "solver": st.sampled_from(["euler", "midpoint", "heun", "rk4", "ab2"]),
     "n_flow_steps": st.integers(1, 3),
-    "time_sampler": st.sampled_from(["grid", "starts", "uniform"]),
+    "time_sampler": st.sampled_from(["grid", "grid_without_end", "uniform"]),
 }
 entropy: dict[str, st.SearchStrategy[Any]] = {
     "n_entropy_actions": st.integers(2, 3),
@@ -114,7 +119,7 @@ own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
         **ode,
         "brownian_coef": coefficients,
         "uniform_noise_coef": coefficients,
-        "path": st.sampled_from(["rectified", "stochastic", "stochastic_exact", "trigflow"]),
+        "interpolant": st.sampled_from(["rectified", "stochastic", "stochastic_exact", "trigflow"]),
         "n_times": st.integers(1, 3),
         "time_average": st.sampled_from(["objective", "shift"]),
         "brownian_reduction": st.sampled_from(["sum", "mean"]),
@@ -123,8 +128,8 @@ own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
     },
     FPO: {
         **ode,
-        "n_probes": st.integers(1, 3),
-        "probe_average": st.sampled_from(["loss", "objective"]),
+        "n_mc_samples": st.integers(1, 3),
+        "mc_average": st.sampled_from(["loss", "objective"]),
         "loss_target": st.sampled_from(["epsilon", "velocity"]),
         "loss_reduction": st.sampled_from(["mean", "sum"]),
         "trust_region": st.sampled_from(["ppo", "spo", "aspo"]),
@@ -162,9 +167,7 @@ refused: dict[str, list[Any]] = {
     "ent_coef": [-0.1, "linear", float("inf")],
     "vf_coef": [float("nan")],
     "desired_kl": [0.0],
-    "lr_adaptation": ["step"],
-    "lr_bounds": [(1e-2, 1e-6)],
-    "lr_factor": [1.0],
+    "lr_adaptation_kwargs": [{"interval": "step"}, {"bounds": (1e-2, 1e-6)}, {"factor": 1.0}],
     "use_sde": [True],
 }
 """Values that cannot work: one of them spoils a draw now and then."""

@@ -24,6 +24,8 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     "silu": nn.SiLU,
     "mish": nn.Mish,
 }
+RENAMED = {"path": "interpolant", "n_probes": "n_mc_samples", "probe_average": "mc_average"}
+"""New names of options by those that studies of earlier versions have."""
 
 
 Sampler = Callable[[Trial, int, int, dict[str, Any]], dict[str, Any]]
@@ -70,12 +72,14 @@ def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
     params = {
         "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
         "brownian_coef": trial.suggest_float("brownian_coef", 1e-4, 0.5, log=True),
-        "path": trial.suggest_categorical("path", ["rectified", "stochastic", "trigflow"]),
+        "interpolant": trial.suggest_categorical(
+            "interpolant", ["rectified", "stochastic", "trigflow"]
+        ),
         "n_flow_steps": trial.suggest_categorical("n_flow_steps", [4, 8, 12]),
         "solver": trial.suggest_categorical("solver", ["midpoint", "euler", "heun", "ab2"]),
         "log_std_init": trial.suggest_float("log_std_init", -2.5, 0.5),
     }
-    if params["path"] != "stochastic":
+    if params["interpolant"] != "stochastic":
         params["latent_std"] = trial.suggest_float("latent_std", 0.1, 1.0, log=True)
     return params
 
@@ -84,8 +88,8 @@ def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
 def sample_fpo_params(trial: Trial) -> dict[str, Any]:
     """Draw hyperparameters of FPO."""
     return {
-        "n_probes": trial.suggest_categorical("n_probes", [4, 8, 16]),
-        "probe_average": trial.suggest_categorical("probe_average", ["loss", "objective"]),
+        "n_mc_samples": trial.suggest_categorical("n_mc_samples", [4, 8, 16]),
+        "mc_average": trial.suggest_categorical("mc_average", ["loss", "objective"]),
         "loss_target": trial.suggest_categorical("loss_target", ["epsilon", "velocity"]),
         "trust_region": trial.suggest_categorical("trust_region", ["ppo", "spo", "aspo"]),
         "difference_clamp": trial.suggest_categorical("difference_clamp", [3.0, 10.0]),
@@ -150,6 +154,8 @@ def finish_sample(trial: Trial, params: dict[str, Any]) -> dict[str, Any]:
 def convert_flow_params(params: dict[str, Any]) -> dict[str, Any]:
     """Turn the raw values of a trial of any flow algorithm into hyperparameters.
 
+    Studies of earlier versions are read too, see :data:`RENAMED`.
+
     >>> raw = {"n_envs": 24, "rollout_pow": 11, "n_minibatches_pow": 6, "one_minus_gamma": 0.01,
     ...        "one_minus_gae_lambda": 0.05, "net_arch": "tiny", "activation_fn": "mish",
     ...        "embedding_dim": 16, "log_std_init": -1.0, "solver": "euler"}
@@ -160,7 +166,7 @@ def convert_flow_params(params: dict[str, Any]) -> dict[str, Any]:
     :param params: What the trial drew.
     :return: Hyperparameters as in a YAML file, ``n_envs`` included.
     """
-    hyperparams = dict(params)
+    hyperparams = {RENAMED.get(name, name): value for name, value in params.items()}
     hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
     hyperparams["gae_lambda"] = 1 - hyperparams.pop("one_minus_gae_lambda")
     hyperparams["n_steps"], hyperparams["batch_size"] = _sizes(

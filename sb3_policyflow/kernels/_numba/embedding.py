@@ -23,10 +23,9 @@ from sb3_policyflow.kernels._numba.options import F, inner, kernel
 from sb3_policyflow.kernels.layouts import (
     FieldGradients,
     FieldLayout,
-    FirstLayerGradients,
+    FirstLayer,
     Floats,
     Integers,
-    TimeLayers,
 )
 
 
@@ -73,30 +72,18 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> No
 
 
 @kernel
-def embed(
-    times: Floats,
-    entries: Integers,
-    features: Floats,
-    field: FieldLayout,
-    saved: TimeLayers,
-    table: Floats,
-    shifts: Floats,
-) -> int:
-    """Evaluate the table of times and the shifts of observations.
+def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer) -> int:
+    """Evaluate what times and features contribute to a field's first layer.
 
     :param times: shape (n_times,); the distinct ones are moved to the front.
-    :param entries: Filled with the entry of the table for each time, shape (n_times,).
     :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
-    :param saved: Filled with the layers of the time embedding.
-    :param table: Filled; shape (n_times, width).
-    :param shifts: Filled; shape (m, width).
-    :return: How many distinct times, and entries of the table, there are.
+    :param first: Filled; the table is as long as there are distinct times.
+    :return: How many distinct times there are.
     """
-    n, dim = _deduplicate(times, entries), field.dim
-    size, width = saved.hidden.shape[1], table.shape[1]
-    hidden, derivatives = saved.hidden[:n], saved.derivatives[:n]
-    embeddings = saved.embeddings[:n]
+    n, dim = _deduplicate(times, first.entries), field.dim
+    size, width, table = first.hidden.shape[1], first.table.shape[1], first.table[:n]
+    hidden, derivatives, embeddings = first.hidden[:n], first.derivatives[:n], first.embeddings[:n]
     phases = _phases(times[:n], vector(field.frequencies, field.n_frequencies))
     weights = transposed(matrix(field.time_hidden_weight, size, 2 * field.n_frequencies))
     _layer(phases, weights, vector(field.time_hidden_bias, size), hidden)
@@ -107,11 +94,11 @@ def embed(
     _layer(hidden, weights, vector(field.time_output_bias, size), embeddings)
     for row in range(n):
         add(vector(field.observation_bias, size), embeddings[row])
-    first = transposed(matrix(field.first_weight, width, dim + size))[dim:]
-    _layer(embeddings, first, vector(field.first_bias, width), table[:n])
-    clear(shifts)
+    of_embedding = transposed(matrix(field.first_weight, width, dim + size))[dim:]
+    _layer(embeddings, of_embedding, vector(field.first_bias, width), table)
+    clear(first.shifts)
     observation = matrix(field.observation_weight, size, features.shape[1])
-    accumulate(features, product(observation.T, first), shifts)
+    accumulate(features, product(observation.T, of_embedding), first.shifts)
     return n
 
 
@@ -120,8 +107,7 @@ def embed_backward(
     times: Floats,
     features: Floats,
     field: FieldLayout,
-    saved: TimeLayers,
-    first: FirstLayerGradients,
+    first: FirstLayer,
     gradients: FieldGradients,
 ) -> None:
     """Gradients of what :func:`embed` takes.
@@ -129,29 +115,27 @@ def embed_backward(
     :param times: The distinct times, shape (n_times,).
     :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
-    :param saved: What :func:`embed` saved.
-    :param first: The gradients of the first layer.
-    :param gradients: Filled.
+    :param first: What :func:`embed` filled.
+    :param gradients: Of the first layer, and filled.
     """
     n, dim, (width, n_inputs) = times.size, field.dim, gradients.first_weight.shape
     size, n_features = n_inputs - dim, features.shape[1]
-    hidden, derivatives = saved.hidden[:n], saved.derivatives[:n]
-    embeddings = saved.embeddings[:n]
+    hidden, derivatives, embeddings = first.hidden[:n], first.derivatives[:n], first.embeddings[:n]
     first_weight = matrix(field.first_weight, width, n_inputs)
     of_embedding = np.empty((width, size), F)
     for row in range(width):
         copy(first_weight[row, dim:], of_embedding[row])
     observation = transposed(matrix(field.observation_weight, size, n_features))
-    grad_folded = product(features.T, first.shifts)
-    grad_of_embedding = product(first.table.T, embeddings)
+    grad_folded = product(features.T, gradients.shifts)
+    grad_of_embedding = product(gradients.table.T, embeddings)
     accumulate(grad_folded.T, observation, grad_of_embedding)
-    grad_embeddings = product(first.table, of_embedding)
+    grad_embeddings = product(gradients.table, of_embedding)
     grad_hidden = product(grad_embeddings, matrix(field.time_output_weight, size, size))
     multiply(grad_hidden.reshape(-1), derivatives.reshape(-1))
     if gradients.features.shape[0] > 0:
         clear(gradients.features)
         folded = product(observation, transposed(of_embedding))
-        accumulate(first.shifts, transposed(folded), gradients.features)
+        accumulate(gradients.shifts, transposed(folded), gradients.features)
 
     phases = _phases(times, vector(field.frequencies, field.n_frequencies))
     _fill_product(grad_hidden.T, phases, gradients.time_hidden_weight)
@@ -165,9 +149,9 @@ def embed_backward(
     copy(gradients.time_output_bias, gradients.observation_bias)
     for row in range(width):
         for i in range(dim):
-            gradients.first_weight[row, i] = first.points[i, row]
+            gradients.first_weight[row, i] = gradients.points[i, row]
         copy(grad_of_embedding[row], gradients.first_weight[row, dim:])
-    _fill_sums(first.table, gradients.first_bias)
+    _fill_sums(gradients.table, gradients.first_bias)
 
 
 @inner

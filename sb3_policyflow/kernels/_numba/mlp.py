@@ -22,7 +22,6 @@ from sb3_policyflow.kernels.layouts import (
     KernelInput,
     MLPGradients,
     MLPLayout,
-    SavedLayers,
 )
 
 
@@ -92,7 +91,8 @@ def forward(
     first: KernelInput,
     network: MLPLayout,
     outputs: Floats,
-    saved: SavedLayers,
+    values: Floats,
+    derivatives: Floats,
     start: int,
     stop: int,
 ) -> None:
@@ -101,7 +101,9 @@ def forward(
     :param first: The first layer.
     :param network: The MLP.
     :param outputs: Filled; shape (n, n_outputs).
-    :param saved: Filled with what :func:`backward` needs, unless its arrays are empty.
+    :param values: Filled with the activations of all hidden layers for :func:`backward`, block by
+        block, n * sum(widths); or empty.
+    :param derivatives: Likewise with their derivatives.
     :param start: The first row.
     :param stop: The row behind the last.
     """
@@ -118,9 +120,9 @@ def forward(
     for begin in range(start, stop, ROWS):
         end = min(begin + ROWS, stop)
         block = workspace[: (end - begin) * n_saved]
-        derivatives_block = saved.derivatives[begin * n_saved : end * n_saved]
-        if saved.derivatives.size > 0:
-            block = saved.values[begin * n_saved : end * n_saved]
+        derivatives_block = derivatives[begin * n_saved : end * n_saved]
+        if derivatives.size > 0:
+            block = values[begin * n_saved : end * n_saved]
         layer = block[: (end - begin) * width].reshape((end - begin, width))
         for row in range(begin, end):
             copy(first.table[entries[row] if entries.size > 0 else 0], layer[row - begin])
@@ -137,7 +139,8 @@ def forward(
 def backward(
     first: KernelInput,
     network: MLPLayout,
-    saved: SavedLayers,
+    values: Floats,
+    derivatives: Floats,
     grad_outputs: Floats,
     gradients: MLPGradients,
     start: int,
@@ -147,7 +150,8 @@ def backward(
 
     :param first: The first layer.
     :param network: The MLP.
-    :param saved: What :func:`forward` saved.
+    :param values: What :func:`forward` filled.
+    :param derivatives: Likewise.
     :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
     :param gradients: Added to; groups of rows that share a shift belong to one call.
     :param start: The first row.
@@ -168,10 +172,8 @@ def backward(
         end = min(begin + ROWS, stop)
         grad = _backward_block(
             network,
-            SavedLayers(
-                saved.values[begin * n_saved : end * n_saved],
-                saved.derivatives[begin * n_saved : end * n_saved],
-            ),
+            values[begin * n_saved : end * n_saved],
+            derivatives[begin * n_saved : end * n_saved],
             grad_outputs[begin:end],
             gradients.parameters[table_end:],
             scratch,
@@ -190,7 +192,8 @@ def backward(
 @inner
 def _backward_block(
     network: MLPLayout,
-    saved: SavedLayers,
+    values: Floats,
+    derivatives: Floats,
     grad_outputs: Floats,
     grads: Floats,
     scratch: Floats,
@@ -202,7 +205,7 @@ def _backward_block(
     :return: The gradient of what the first layer yields, shape (rows, widths[0]).
     """
     rows, n_out = grad_outputs.shape
-    end, used = saved.values.size, grads.size
+    end, used = values.size, grads.size
     grad, side = grad_outputs, 0
     for layer in range(network.widths.size, 0, -1):
         n_in = network.widths[layer - 1]
@@ -212,10 +215,10 @@ def _backward_block(
             add(grad[row], grads[used : used + n_out])
         used -= n_in * n_out
         grad_weight = grads[used : used + n_in * n_out].reshape((n_out, n_in))
-        accumulate(grad.T, saved.values[begin:end].reshape((rows, n_in)), grad_weight)
+        accumulate(grad.T, values[begin:end].reshape((rows, n_in)), grad_weight)
         grad_input = scratch[side, : rows * n_in].reshape((rows, n_in))
         clear(grad_input)
         accumulate(grad, matrix(network.weights[layer], n_out, n_in), grad_input)
-        multiply(grad_input.reshape(-1), saved.derivatives[begin:end])
+        multiply(grad_input.reshape(-1), derivatives[begin:end])
         grad, side, end, n_out = grad_input, 1 - side, begin, n_in
     return grad

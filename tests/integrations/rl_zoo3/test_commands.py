@@ -165,5 +165,5 @@ def test_optimize_in_one_command(installed: Environment, tmp_path: Path) -> None
     options += ["--storage", "sqlite:///study.db", "--study-name", "s"]
     output = installed.run(*TRAIN, "--algo", "policyflow", *options, folder=tmp_path)
     assert "Number of finished trials:  2" in output
-    for name in ("brownian_coef", "n_flow_steps", "solver", "path", "embedding_dim"):
+    for name in ("brownian_coef", "n_flow_steps", "solver", "interpolant", "embedding_dim"):
         assert re.search(rf"^    {name}: ", output, re.MULTILINE)

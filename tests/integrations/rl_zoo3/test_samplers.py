@@ -51,6 +51,20 @@ def test_raw_values_make_the_same_hyperparameters_again(algo: str, n_envs: int) 
             assert hyperparams[name] == value
 
 
+@pytest.mark.parametrize(
+    ("algo", "old_names"),
+    [
+        ("policyflow", {"interpolant": "path"}),
+        ("fpo", {"n_mc_samples": "n_probes", "mc_average": "probe_average"}),
+    ],
+)
+def test_studies_of_earlier_versions_can_be_read(algo: str, old_names: dict[str, str]) -> None:
+    for trial, _ in draws(algo, 4, 5):
+        old = {old_names.get(name, name): value for name, value in trial.params.items()}
+        assert old.keys() != trial.params.keys()
+        assert convert_flow_params(old) == convert_flow_params(trial.params)
+
+
 @pytest.mark.slow
 def test_whatever_is_drawn_can_be_constructed_and_learns(algo: str) -> None:
     """All of it but the long rollouts and many epochs, which are a matter of patience."""
@@ -66,11 +80,11 @@ def test_whatever_is_drawn_can_be_constructed_and_learns(algo: str) -> None:
 def test_every_choice_is_drawn_and_reaches_the_policy() -> None:
     env = gym.make("Pendulum-v1")
     drawn = [hyperparams for _, hyperparams in draws("policyflow", 1, 100)]
-    assert {params["path"] for params in drawn} == {"rectified", "stochastic", "trigflow"}
+    assert {params["interpolant"] for params in drawn} == {"rectified", "stochastic", "trigflow"}
     assert {params["solver"] for params in drawn} == {"euler", "midpoint", "heun", "ab2"}
     assert {params["desired_kl"] for params in drawn} == {None, 0.005, 0.01, 0.02}
     spread = [params["policy_kwargs"].get("latent_std") for params in drawn]  # type: ignore[attr-defined]
-    stochastic = [params["path"] == "stochastic" for params in drawn]
+    stochastic = [params["interpolant"] == "stochastic" for params in drawn]
     assert [std is None for std in spread] == stochastic
     assert all(0.1 <= std <= 1 for std in spread if std is not None)
     model = PolicyFlow("MlpPolicy", env, **drawn[0])

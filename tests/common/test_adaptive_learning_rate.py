@@ -14,7 +14,7 @@ RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))
         (6e-4, 0.0049, 9e-4),  # less than half the target
         (1.2e-4, 0.1, 1e-4),  # stops at the bounds
         (9e-4, 0.0, 1e-3),
-        (3e-3, 0.0, 3e-3),  # beyond them it only ever comes nearer
+        (3e-3, 0.0, 3e-3),  # a start outside them may only move towards them
         (3e-3, 0.1, 2e-3),
         (1e-5, 0.1, 1e-5),
         (1e-5, 0.0, 1.5e-5),
@@ -32,6 +32,6 @@ def test_rule(learning_rate: float, kl: float, expected: float) -> None:
         ({"bounds": (1e-2, 1e-6)}, "bounds must be two numbers in order"),
     ],
 )
-def test_senseless_rules_are_refused(options: dict[str, float], message: str) -> None:
+def test_rules_that_cannot_work_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         KLAdaptiveLearningRate(**options)  # type: ignore[arg-type]
