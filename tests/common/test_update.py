@@ -2,6 +2,7 @@
 
 import pytest
 import torch as th
+
 from sb3_policyflow.common.update import UpdateMetrics
 
 
