@@ -21,17 +21,20 @@ from stable_baselines3.common.vec_env import VecMonitor
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.flows import INTERPOLANTS, SOLVERS
 from tests.helpers import TWO_EPOCHS, n_updates, train, weights
 
 
 @pytest.mark.parametrize("alias", ["MlpFlowPolicy", "MlpPolicy"])
-@pytest.mark.parametrize("path", ["rectified", "stochastic", "stochastic_exact", "trigflow"])
-def test_every_path_trains(alias: str, path: str) -> None:
-    model = PolicyFlow(alias, "Pendulum-v1", path=path, brownian_coef=0.1, **TWO_EPOCHS)
+@pytest.mark.parametrize("interpolant", INTERPOLANTS)
+def test_every_interpolant_trains(alias: str, interpolant: str) -> None:
+    model = PolicyFlow(
+        alias, "Pendulum-v1", interpolant=interpolant, brownian_coef=0.1, **TWO_EPOCHS
+    )
     train(model, 128)
 
 
-@pytest.mark.parametrize("solver", ["euler", "midpoint", "heun", "rk4", "ab2"])
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_every_solver_and_time_sampler_trains(solver: str) -> None:
     for sampler, n_times, average in [("grid", 1, "objective"), ("uniform", 3, "shift")]:
         model = PolicyFlow(
