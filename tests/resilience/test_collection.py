@@ -25,19 +25,19 @@ class Clock(gym.Env[Any, Any]):
         self.action_space = spaces.Box(-1, 1, (1,))
         self.limit, self.ends = limit, ends
 
-    def _obs(self) -> Any:
+    def observation(self) -> Any:
         obs = np.array([self.time], dtype=np.float32)
         return {"time": obs} if self.as_dict else obs
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.time = 0
-        return self._obs(), {}
+        return self.observation(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.time += 1
         over = self.time >= self.limit
-        return self._obs(), 1.0, over and self.ends, over and not self.ends, {}
+        return self.observation(), 1.0, over and self.ends, over and not self.ends, {}
 
 
 def clocks(as_dict: bool = False) -> DummyVecEnv:
