@@ -26,10 +26,12 @@ def _on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     def get_device(device: th.device | str = "auto") -> th.device:
         return utils.get_device("cpu" if device == "auto" else device)
 
-    for name, module in list(sys.modules.items()):
-        if name.startswith("stable_baselines3.") and hasattr(module, "get_device"):
-            if module is not utils and th.cuda.is_available():
-                monkeypatch.setattr(module, "get_device", get_device)
+    users = [
+        module for name, module in sys.modules.items() if name.startswith("stable_baselines3.")
+    ]
+    for module in users if th.cuda.is_available() else []:
+        if hasattr(module, "get_device") and module is not utils:
+            monkeypatch.setattr(module, "get_device", get_device)
 
 
 @pytest.fixture(params=[PolicyFlow, FPO, DPPO], ids=lambda algorithm: str(algorithm.__name__))
