@@ -1,7 +1,6 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, TypeVar
 
@@ -12,13 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.buffers import (
-    DictFlowRolloutBuffer,
-    FlowRolloutBuffer,
-    FlowRolloutBufferSamples,
-)
+from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.checks import Check
-from sb3_policyflow.common.losses import clipped_value_loss, normalize
+from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.optimization import clip_gradients
 from sb3_policyflow.common.options import (
     FORMER_NAMES,
@@ -57,6 +52,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     """
 
     policy_base: ClassVar[type[FlowPolicy]]
+    update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = FORMER_NAMES
     """Present names of options by former ones."""
     divergence_advice: ClassVar[str] = ""
@@ -115,6 +111,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.policy_options = policy_options
+        self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
         self._adaptive_start: float | None = None
         super().__init__(
@@ -203,27 +200,20 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     # The update
 
-    @abstractmethod
-    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> FlowUpdate:
-        """The algorithm's part of the update of a rollout, before the policy changes.
-
-        :param rollout: The whole rollout of n samples.
-        """
-
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         rollout = self.rollout_buffer.samples()
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
-        update = self._begin_update(rollout)
+        update = self.update_class(self, rollout)  # line 3: remembers the reference policy
         self._update_learning_rate(self.policy.optimizer)
         clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
-        rule = KLAdaptiveLearningRate.of("lr_adaptation_kwargs", self.lr_adaptation_kwargs)
+        rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
         for _ in range(self.n_epochs):  # line 13
             kls = [] if rule.window == "epoch" else kls
-            samples = rollout._replace(drawn=update.draw(rollout))  # lines 15 to 17
+            samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
                 features, critic_features = self.policy.actor_critic_features(batch.observations)
@@ -257,7 +247,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         """Advantages, shape (n,), normalized if this is the scope in which that is done."""
         # One sample has no standard deviation.
         if self.normalize_advantage and self.advantage_scope == scope and len(advantages) > 1:
-            return normalize(advantages)
+            return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return advantages
 
     def _optimize(
@@ -284,6 +274,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.policy.keep_within_bounds()
 
     def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+        """Log what the update did, and count its rollout."""
+        self.n_rollouts += 1
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())

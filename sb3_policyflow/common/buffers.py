@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.tree import rows, size_in_bytes
+from sb3_policyflow.common.tree import rows, tensors
 
 SHUFFLED_AT_ONCE = 2**26
 """Bytes of a rollout up to which a shuffled copy of it is made for each epoch."""
@@ -88,26 +88,25 @@ class RecordBufferMixin(RolloutBuffer):
         """
         assert self.full, "The buffer holds no complete rollout yet"
         assert self.record_type is not None
-        record = self.record_type(
-            *(self._flatten(getattr(self, name)) for name in self.record_type._fields)
-        )
+
+        def flatten(array: np.ndarray) -> th.Tensor:
+            flat = array.reshape(self.buffer_size * self.n_envs, *array.shape[2:])
+            return th.as_tensor(flat, device=self.device)
+
         observations: Any = self.observations
         if isinstance(observations, dict):
-            observations = {key: self._flatten(values) for key, values in observations.items()}
+            observations = {key: flatten(values) for key, values in observations.items()}
         else:
-            observations = self._flatten(observations)
+            observations = flatten(observations)
+        record = (flatten(getattr(self, name)) for name in self.record_type._fields)
         return FlowRolloutBufferSamples(
             observations=observations,
-            actions=self._flatten(self.actions),
-            old_values=self._flatten(self.values),
-            advantages=self._flatten(self.advantages),
-            returns=self._flatten(self.returns),
-            record=record,
+            actions=flatten(self.actions),
+            old_values=flatten(self.values),
+            advantages=flatten(self.advantages),
+            returns=flatten(self.returns),
+            record=self.record_type(*record),
         )
-
-    def _flatten(self, array: np.ndarray) -> th.Tensor:
-        flat = array.reshape(self.buffer_size * self.n_envs, *array.shape[2:])
-        return th.as_tensor(flat, device=self.device)
 
     def minibatches(
         self, samples: FlowRolloutBufferSamples, batch_size: int | None = None
@@ -127,7 +126,7 @@ class RecordBufferMixin(RolloutBuffer):
         )
         size = batch_size or n_samples
         parts = [slice(start, start + size) for start in range(0, n_samples, size)]
-        if size_in_bytes(samples) <= SHUFFLED_AT_ONCE:
+        if sum(tensor.nbytes for tensor in tensors(samples)) <= SHUFFLED_AT_ONCE:
             # Many views of one shuffled copy are faster than many gathers of few rows.
             shuffled = rows(samples, indices)
             yield from (rows(shuffled, part) for part in parts)

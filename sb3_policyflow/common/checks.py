@@ -76,6 +76,16 @@ def finite(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a finite number, got {value!r}.")
 
 
+def greater_than(lowest: float) -> Check:
+    """A number above a lowest one."""
+
+    def check(name: str, value: object) -> None:
+        if not isinstance(value, Real) or not float(value) > lowest:
+            raise ValueError(f"{name} must be greater than {lowest:g}, got {value!r}.")
+
+    return check
+
+
 def positive(name: str, value: object) -> None:
     """A positive number."""
     if not isinstance(value, Real) or not float(value) > 0:
@@ -106,6 +116,13 @@ def bounds(name: str, value: object) -> None:
     are_numbers = all(isinstance(end, Real) for end in ends)
     if len(ends) != 2 or not are_numbers or not ends[0] <= ends[1]:
         raise ValueError(f"{name} must be two numbers in order, got {value!r}.")
+
+
+def positive_bounds(name: str, value: object) -> None:
+    """A lowest and a highest positive number."""
+    bounds(name, value)
+    if not value[0] > 0:  # type: ignore[index]  # two numbers by now
+        raise ValueError(f"{name} must be positive, got {value!r}.")
 
 
 def or_none(check: Check) -> Check:

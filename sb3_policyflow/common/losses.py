@@ -28,14 +28,10 @@ def shifted_gaussian_log_ratio(
     :param old_log_std: log sigma when the action was made, shape (action_dim,).
     :return: log rho, shape (...).
     """
-    new = _gaussian_energy(noise - shift, log_std)
-    old = _gaussian_energy(noise, old_log_std)
+    # Energies -log N without their constant, for each dimension
+    new = 0.5 * ((noise - shift) / log_std.exp()) ** 2 + log_std
+    old = 0.5 * (noise / old_log_std.exp()) ** 2 + old_log_std
     return (old - new).sum(dim=-1)
-
-
-def _gaussian_energy(deviation: th.Tensor, log_std: th.Tensor) -> th.Tensor:
-    """-log N(deviation; 0, sigma^2) without its constant, per dimension."""
-    return 0.5 * (deviation / log_std.exp()) ** 2 + log_std
 
 
 def gaussian_kl(shift: th.Tensor, log_std: th.Tensor, old_log_std: th.Tensor) -> th.Tensor:
@@ -82,13 +78,9 @@ def clipped_surrogate(
     :return: The objective, shape (...).
     """
     ratio = log_ratio.exp()
-    clipped = _clamp(ratio, 1 - clip_range, 1 + clip_range)
+    bounds: tuple[Any, Any] = (1 - clip_range, 1 + clip_range)  # of numbers, or of tensors
+    clipped = ratio.clamp(*bounds)
     return th.min(ratio * advantages, clipped * advantages)
-
-
-def _clamp(values: th.Tensor, low: Any, high: Any) -> th.Tensor:
-    """Keep within bounds; torch's own signatures are for two numbers or two tensors, not either."""
-    return values.clamp(low, high)
 
 
 def penalized_surrogate(
@@ -129,11 +121,6 @@ SURROGATES: dict[str, Callable[[th.Tensor, th.Tensor, float | th.Tensor], th.Ten
     "aspo": asymmetric_surrogate,
 }
 """Objectives that keep the policy near the old one, by the name of their trust region."""
-
-
-def normalize(advantages: th.Tensor) -> th.Tensor:
-    """Advantages, shape (n,), of mean 0 and standard deviation 1."""
-    return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
 
 def clipped_value_loss(

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
+from sb3_policyflow.common.schedules import Coefficient, check_lr_adaptation, parse_schedule
 
 P = ParamSpec("P")
 FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
@@ -67,7 +67,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "ent_coef": parse_schedule,
     "target_kl": checks.positive_or_none,
     "desired_kl": checks.or_none(parse_schedule),
-    "lr_adaptation_kwargs": KLAdaptiveLearningRate.of,
+    "lr_adaptation_kwargs": check_lr_adaptation,
     "max_grad_norm": checks.or_none(checks.between(-math.inf)),
     "n_steps": checks.at_least(1),
     "n_epochs": checks.at_least(1),
@@ -77,13 +77,14 @@ SHARED_CHECKS: dict[str, checks.Check] = {
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
 
 FORMER_NAMES = {
+    "_n_rollouts": "n_rollouts",
     "lr_adaptation": "lr_adaptation_kwargs.interval",
     "lr_factor": "lr_adaptation_kwargs.factor",
     "lr_bounds": "lr_adaptation_kwargs.bounds",
     "kl_margin": "lr_adaptation_kwargs.margin",
     "kl_window": "lr_adaptation_kwargs.window",
 }
-"""Present names of the shared options by former ones."""
+"""Present names of the shared options, and of an attribute in files, by former ones."""
 
 
 def shares_options(

@@ -195,8 +195,12 @@ class FlowPolicy(ActorCriticPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
-        if not is_in_mode(self, mode):
-            super().set_training_mode(mode)
+        modules: list[nn.Module | None] = [self]
+        for module in modules:  # grows; much faster than Module.modules()
+            if module is not None and module.training is not mode:
+                super().set_training_mode(mode)
+                return
+            modules += module._modules.values() if module is not None else ()
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
@@ -277,13 +281,6 @@ class FlowPolicy(ActorCriticPolicy):
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )
-
-
-def is_in_mode(module: nn.Module, mode: bool) -> bool:
-    """Whether a module and all modules within it are in training mode, or in evaluation mode."""
-    if module.training is not mode:
-        return False
-    return all(is_in_mode(child, mode) for child in module._modules.values() if child is not None)
 
 
 def policy_aliases(

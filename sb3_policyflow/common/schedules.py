@@ -1,8 +1,9 @@
 """Coefficients and learning rates that change during training."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -32,25 +33,20 @@ def parse_schedule(name: str, value: object) -> FloatSchedule:
     """
     if callable(value):
         return FloatSchedule(value)
-    start, end = _ends(name, value)
-    if not (0.0 <= start < float("inf") and 0.0 <= end < float("inf")):
-        raise ValueError(f"{name} must not be negative nor infinite, got {value!r}.")
-    constant = start == end
-    return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
-
-
-def _ends(name: str, value: Any) -> tuple[float, float]:
-    """First and last value of a constant or linear schedule."""
+    number: Any = value
+    linear = _LINEAR.fullmatch(value) if isinstance(value, str) else None
     try:
-        linear = _LINEAR.fullmatch(value) if isinstance(value, str) else None
-        if linear is None:
-            return float(value), float(value)
-        return float(linear["start"]), float(linear["end"] or 0.0)
+        start = float(number if linear is None else linear["start"])
+        end = start if linear is None else float(linear["end"] or 0.0)
     except (TypeError, ValueError):
         raise ValueError(
             f"{name} must be a number, a string such as 'lin_0.25' or 'lin_0.25_0.05', or a "
             f"function of the remaining progress, got {value!r}."
         ) from None
+    if not (0.0 <= start < float("inf") and 0.0 <= end < float("inf")):
+        raise ValueError(f"{name} must not be negative nor infinite, got {value!r}.")
+    constant = start == end
+    return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
 
 
 @dataclass(frozen=True)
@@ -72,41 +68,21 @@ class KLAdaptiveLearningRate:
     :param margin: Factor by which the divergence may miss the target before the rate moves.
     :param bounds: Lowest and highest learning rate. A start outside the bounds is kept and may only
         move towards them.
-    :raises ValueError: If a parameter is out of its range.
     """
+
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "interval": checks.one_of(("epoch", "minibatch")),
+        "window": checks.one_of(("epoch", "update")),
+        "factor": checks.greater_than(1.0),
+        "margin": checks.between(1.0),
+        "bounds": checks.positive_bounds,
+    }
 
     interval: str = "epoch"
     window: str = "epoch"
     factor: float = 1.5
     margin: float = 2.0
     bounds: tuple[float, float] = (1e-6, 1e-2)
-
-    def __post_init__(self) -> None:
-        checks.one_of(("epoch", "minibatch"))("interval", self.interval)
-        checks.one_of(("epoch", "update"))("window", self.window)
-        checks.between(1)("margin", self.margin)
-        checks.positive("factor", self.factor)
-        checks.bounds("bounds", self.bounds)
-        if self.factor <= 1:
-            raise ValueError(f"factor must be greater than 1, got {self.factor}.")
-        if self.bounds[0] <= 0:
-            raise ValueError(f"bounds must be positive, got {self.bounds}.")
-
-    @classmethod
-    def of(cls, name: str, options: Any) -> "KLAdaptiveLearningRate":
-        """The rule with these options.
-
-        :param name: What the options are called, for error messages.
-        :param options: A dictionary of the parameters, or None for the defaults.
-        :raises ValueError: If an option is unknown or cannot be used.
-        """
-        try:
-            return cls(**(options or {}))
-        except TypeError as error:
-            known = ", ".join(cls.__dataclass_fields__)
-            raise ValueError(f"{name} must be a dictionary of {known}, got {options!r}.") from error
-        except ValueError as error:
-            raise ValueError(f"In {name}, {error}") from error
 
     def adapt(self, learning_rate: float, kl: float, desired_kl: float) -> float:
         """The learning rate after ``kl`` nats were measured where ``desired_kl`` were wanted."""
@@ -117,3 +93,21 @@ class KLAdaptiveLearningRate:
         if kl < desired_kl / self.margin:
             return min(learning_rate * self.factor, highest)
         return learning_rate
+
+
+def check_lr_adaptation(name: str, options: Any) -> None:
+    """Refuse options that :class:`KLAdaptiveLearningRate` cannot use.
+
+    :param name: What the options are called, for error messages.
+    :param options: A dictionary of its parameters, or None for the defaults.
+    :raises ValueError: If an option is unknown or out of its range.
+    """
+    try:
+        rule = KLAdaptiveLearningRate(**(options or {}))
+    except TypeError as error:
+        known = ", ".join(KLAdaptiveLearningRate.option_checks)
+        raise ValueError(f"{name} must be a dictionary of {known}, got {options!r}.") from error
+    try:
+        checks.check_options(rule)
+    except ValueError as error:
+        raise ValueError(f"In {name}, {error}") from error

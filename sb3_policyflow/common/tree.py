@@ -36,21 +36,16 @@ def rows(tree: T, chosen: th.Tensor | slice) -> T:
 
 
 def tensors(tree: Any) -> Iterator[th.Tensor]:
-    """Every tensor in nested dictionaries and tuples."""
+    """Every tensor in nested dictionaries and tuples.
+
+    >>> sum(tensor.nbytes for tensor in tensors({"a": th.zeros(3), "b": (th.zeros(2),)}))
+    20
+    """
     if isinstance(tree, th.Tensor):
         yield tree
     else:
         for part in tree.values() if isinstance(tree, dict) else tree:
             yield from tensors(part)
-
-
-def size_in_bytes(tree: Any) -> int:
-    """Size of all tensors in nested dictionaries and tuples.
-
-    >>> size_in_bytes({"a": th.zeros(3), "b": (th.zeros(2, dtype=th.int64),)})
-    28
-    """
-    return sum(tensor.nbytes for tensor in tensors(tree))
 
 
 def in_chunks(function: Callable[[T], th.Tensor], tree: T) -> th.Tensor:

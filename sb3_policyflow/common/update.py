@@ -29,25 +29,27 @@ class FlowUpdate(ABC):
 
     It is made before the first gradient step, so that it can remember the policy that collected
     the rollout: the reference policy.
+
+    ``clip_range`` is epsilon, one number or of a shape that broadcasts with a log ratio (n, ...).
+    Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
+    ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
+    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout.
+
+    :param algorithm: The algorithm, whose policy has not been updated yet.
+    :param rollout: The whole rollout of n samples.
     """
 
-    trust_region: str = "ppo"
-    """Name of the surrogate objective."""
-    clip_range: float | th.Tensor
-    """epsilon, one number or of a shape that broadcasts with a log ratio (n, ...)."""
-    log_ratio_clamp: float | None = None
-    """Log ratios beyond it have no gradient; None for no bound."""
-    surrogate_weights: th.Tensor | None = None
-    """Weights of the surrogates of a sample, of the trailing shape of a log ratio; None for 1."""
-    trains_actor: bool = True
-    """Whether the actor learns from this rollout, or only the critic."""
+    def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
+        self.rollout = rollout
+        self.trust_region: str = algorithm.trust_region
+        self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
+        self.log_ratio_clamp: float | None = None
+        self.surrogate_weights: th.Tensor | None = None
+        self.trains_actor = True
 
     @abstractmethod
-    def draw(self, rollout: FlowRolloutBufferSamples) -> Any:
-        """What an epoch draws anew for each sample: a NamedTuple of tensors (n, ...).
-
-        :param rollout: The whole rollout of n samples.
-        """
+    def draw(self) -> tuple[th.Tensor, ...]:
+        """What an epoch draws anew for each sample: a NamedTuple of tensors (n, ...)."""
 
     @abstractmethod
     def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:

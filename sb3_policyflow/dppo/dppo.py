@@ -26,6 +26,62 @@ from sb3_policyflow.dppo.policies import (
 )
 
 
+class DPPOUpdate(FlowUpdate):
+    """DPPO's part of the update of one rollout, whose record has the reference policy's means.
+
+    :param algorithm: The algorithm, whose policy has not been updated yet.
+    :param rollout: The whole rollout of n samples.
+    """
+
+    def __init__(self, algorithm: "DPPO", rollout: FlowRolloutBufferSamples) -> None:
+        super().__init__(algorithm, rollout)
+        self.policy = algorithm.policy
+        self.trains_actor = algorithm.n_rollouts >= algorithm.n_critic_warmup
+        self.log_prob_clamp = algorithm.log_prob_clamp
+        self.log_prob_reduction = algorithm.log_prob_reduction
+        self.entropy_bonus = EntropyBonus(
+            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
+        )
+        self.stds = self.policy.log_prob_stds
+        steps_left = th.arange(len(self.stds), device=self.stds.device).flip(0)
+        self.surrogate_weights = algorithm.denoising_gamma**steps_left
+        if algorithm.clip_range_base is not None:
+            # From 0 to 1 over the trained steps; a single step is a last one.
+            position = th.linspace(1, 0, len(self.stds), device=self.stds.device).flip(0)
+            rate, base = algorithm.clip_range_rate, algorithm.clip_range_base
+            rise = th.expm1(rate * position) / math.expm1(rate)
+            self.clip_range = base + (self.clip_range - base) * rise
+
+    def draw(self) -> tuple[()]:
+        """Nothing: every epoch evaluates all trained steps."""
+        return ()
+
+    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
+        """Ratios of the trained denoising steps (DPPO, policy gradient of the two-layer MDP)."""
+        record: DPPORecord = batch.record
+        means = self.policy.trained_means(record.points[:, :-1], features)
+        log_ratio = self.log_probs(record, means) - self.log_probs(record, record.means)
+        # The divergence of the chains, given the points at which their steps start
+        change = (means - record.means) / self.stds.unsqueeze(-1)
+        kl = 0.5 * change.square().sum(dim=(-2, -1)).mean()
+        # Entropy of the actions, from samples
+        regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
+        return PolicyTerms(log_ratio, kl, regularizer, metrics)
+
+    def log_probs(self, record: DPPORecord, means: th.Tensor) -> th.Tensor:
+        """Log likelihoods of the trained steps around some means, shape (n, k).
+
+        :param record: The steps.
+        :param means: Shape (n, k, action_dim).
+        """
+        stds = self.stds.unsqueeze(-1)
+        energy = 0.5 * ((record.points[:, 1:] - means) / stds).square()
+        log_probs = -energy - stds.log() - 0.5 * math.log(2 * math.pi)
+        if self.log_prob_clamp is not None:
+            log_probs = log_probs.clamp(*self.log_prob_clamp)
+        return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)
+
+
 class DPPO(FlowOnPolicyAlgorithm):
     """On-policy learning with diffusion policies.
 
@@ -54,6 +110,7 @@ class DPPO(FlowOnPolicyAlgorithm):
     """
 
     policy_base = DPPOPolicy
+    update_class = DPPOUpdate
     policy: DPPOPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = policy_aliases(
         MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
@@ -94,70 +151,9 @@ class DPPO(FlowOnPolicyAlgorithm):
         self.n_critic_warmup = n_critic_warmup
         self.n_entropy_actions = n_entropy_actions
         self.n_entropy_states = n_entropy_states
-        self._n_rollouts = 0
         super().__init__(policy, env, *args, **options)
 
     @property
     def n_evaluations_per_sample(self) -> int:
         """Evaluations of the network for one sample in one gradient step."""
         return len(self.policy.log_prob_stds)
-
-    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> "DPPOUpdate":  # noqa: ARG002
-        self._n_rollouts += 1
-        return DPPOUpdate(self, trains_actor=self._n_rollouts > self.n_critic_warmup)
-
-
-class DPPOUpdate(FlowUpdate):
-    """DPPO's part of the update of one rollout, whose record has the reference policy's means.
-
-    :param algorithm: The algorithm.
-    :param trains_actor: Whether the actor learns, or only the critic.
-    """
-
-    def __init__(self, algorithm: DPPO, trains_actor: bool = True) -> None:
-        self.policy = algorithm.policy
-        self.trains_actor = trains_actor
-        self.log_prob_clamp = algorithm.log_prob_clamp
-        self.log_prob_reduction = algorithm.log_prob_reduction
-        self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
-        )
-        self.stds = self.policy.log_prob_stds
-        steps_left = th.arange(len(self.stds), device=self.stds.device).flip(0)
-        self.surrogate_weights = algorithm.denoising_gamma**steps_left
-        self.clip_range = clip_range = algorithm.value_of("clip_range")
-        if algorithm.clip_range_base is not None:
-            # From 0 to 1 over the trained steps; a single step is a last one.
-            position = th.linspace(1, 0, len(self.stds), device=self.stds.device).flip(0)
-            rate, base = algorithm.clip_range_rate, algorithm.clip_range_base
-            rise = th.expm1(rate * position) / math.expm1(rate)
-            self.clip_range = base + (clip_range - base) * rise
-
-    def draw(self, rollout: FlowRolloutBufferSamples) -> tuple[()]:  # noqa: ARG002
-        """Nothing: every epoch evaluates all trained steps."""
-        return ()
-
-    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
-        """Ratios of the trained denoising steps (DPPO, policy gradient of the two-layer MDP)."""
-        record: DPPORecord = batch.record
-        means = self.policy.trained_means(record.points[:, :-1], features)
-        log_ratio = self.log_probs(record, means) - self.log_probs(record, record.means)
-        # The divergence of the chains, given the points at which their steps start
-        change = (means - record.means) / self.stds.unsqueeze(-1)
-        kl = 0.5 * change.square().sum(dim=(-2, -1)).mean()
-        # Entropy of the actions, from samples
-        regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
-        return PolicyTerms(log_ratio, kl, regularizer, metrics)
-
-    def log_probs(self, record: DPPORecord, means: th.Tensor) -> th.Tensor:
-        """Log likelihoods of the trained steps around some means, shape (n, k).
-
-        :param record: The steps.
-        :param means: Shape (n, k, action_dim).
-        """
-        stds = self.stds.unsqueeze(-1)
-        energy = 0.5 * ((record.points[:, 1:] - means) / stds).square()
-        log_probs = -energy - stds.log() - 0.5 * math.log(2 * math.pi)
-        if self.log_prob_clamp is not None:
-            log_probs = log_probs.clamp(*self.log_prob_clamp)
-        return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)

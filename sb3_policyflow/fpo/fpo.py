@@ -27,6 +27,85 @@ from sb3_policyflow.fpo.policies import (
 )
 
 
+class MonteCarloSamples(NamedTuple):
+    """Where flow-matching losses are compared, for n samples of the rollout and k draws each.
+
+    Times t (n, k), noises eps (n, k, action_dim), and the losses of the reference policy (n, k).
+    """
+
+    times: th.Tensor
+    noises: th.Tensor
+    reference_losses: th.Tensor
+
+
+class FPOUpdate(FlowUpdate):
+    """FPO's part of the update of one rollout.
+
+    Times and noises are drawn here and not when acting. They are the same in distribution, because
+    parameters do not change during a rollout, and cost ``predict`` and the buffer nothing.
+
+    :param algorithm: The algorithm, whose policy has not been updated yet.
+    :param rollout: The whole rollout of n samples.
+    """
+
+    def __init__(self, algorithm: "FPO", rollout: FlowRolloutBufferSamples) -> None:
+        super().__init__(algorithm, rollout)
+        self.policy = policy = algorithm.policy
+        self.algorithm = algorithm
+        self.entropy_bonus = EntropyBonus(
+            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
+        )
+        n_samples, action_dim = rollout.actions.shape
+        sampler = TIME_SAMPLERS[algorithm.time_sampler](policy.flow.times())
+        times = sampler.sample(n_samples, algorithm.n_mc_samples)
+        noises = th.randn(*times.shape, action_dim, device=times.device)
+        drawn = MonteCarloSamples(times, noises, times.new_empty(times.shape))
+        losses = in_chunks(
+            lambda part: self.losses(part, policy.actor_features(part.observations)),
+            rollout._replace(drawn=drawn),
+        )
+        self.drawn = drawn._replace(reference_losses=losses)
+
+    def draw(self) -> MonteCarloSamples:
+        """The same samples in every epoch."""
+        return self.drawn
+
+    def losses(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> th.Tensor:
+        """Flow-matching losses of the actions at their times and noises, shape (n, k).
+
+        The noise that a velocity v stands for is x_t - t v: its error is t times the velocity's.
+
+        :param batch: n samples, with what was drawn for them.
+        :param features: The actor's features, shape (n, features_dim).
+        """
+        times, noises, _ = batch.drawn
+        actions = batch.actions.unsqueeze(1)
+        points = self.policy.flow.interpolant.interpolate(noises, actions, times)
+        velocity: th.Tensor = self.policy.velocity(points, times, features.unsqueeze(1))
+        error = velocity - (actions - noises)
+        if self.algorithm.loss_target == "epsilon":
+            error = times.unsqueeze(-1) * error
+        squares = error.square()
+        sums = self.algorithm.loss_reduction == "sum"
+        losses: th.Tensor = squares.sum(-1) if sums else squares.mean(-1)
+        clamp = self.algorithm.loss_clamp
+        return losses if clamp is None else losses.clamp(max=clamp)
+
+    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
+        """Ratio from the change of the flow-matching loss (FPO, equation of the ratio)."""
+        losses = self.losses(batch, features)
+        log_ratio = batch.drawn.reference_losses - losses
+        clamp = self.algorithm.difference_clamp
+        if clamp is not None:
+            log_ratio = log_ratio.clamp(-clamp, clamp)
+        if self.algorithm.mc_average == "loss":
+            log_ratio = log_ratio.mean(dim=1)
+        # Entropy of the actions, from samples
+        regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
+        metrics["flow_matching_loss"] = losses.mean()
+        return PolicyTerms(log_ratio, ratio_divergence(log_ratio), regularizer, metrics)
+
+
 class FPO(FlowOnPolicyAlgorithm):
     """On-policy learning with flow policies and flow-matching losses.
 
@@ -59,6 +138,7 @@ class FPO(FlowOnPolicyAlgorithm):
     """
 
     policy_base = FPOPolicy
+    update_class = FPOUpdate
     policy: FPOPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = policy_aliases(
         MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
@@ -117,86 +197,3 @@ class FPO(FlowOnPolicyAlgorithm):
     def n_evaluations_per_sample(self) -> int:
         """Evaluations of the velocity for one sample in one gradient step."""
         return self.n_mc_samples
-
-    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> "FPOUpdate":
-        return FPOUpdate(self, rollout)
-
-
-class MonteCarloSamples(NamedTuple):
-    """Where flow-matching losses are compared, for n samples of the rollout and k draws each.
-
-    Times t (n, k), noises eps (n, k, action_dim), and the losses of the reference policy (n, k).
-    """
-
-    times: th.Tensor
-    noises: th.Tensor
-    reference_losses: th.Tensor
-
-
-class FPOUpdate(FlowUpdate):
-    """FPO's part of the update of one rollout.
-
-    Times and noises are drawn here and not when acting. They are the same in distribution, because
-    parameters do not change during a rollout, and cost ``predict`` and the buffer nothing.
-
-    :param algorithm: The algorithm, whose policy has not been updated yet.
-    :param rollout: The whole rollout of n samples.
-    """
-
-    def __init__(self, algorithm: FPO, rollout: FlowRolloutBufferSamples) -> None:
-        self.policy = policy = algorithm.policy
-        self.algorithm = algorithm
-        self.trust_region = algorithm.trust_region
-        self.clip_range = algorithm.value_of("clip_range")
-        self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
-        )
-        n_samples, action_dim = rollout.actions.shape
-        sampler = TIME_SAMPLERS[algorithm.time_sampler](policy.flow.times())
-        times = sampler.sample(n_samples, algorithm.n_mc_samples)
-        noises = th.randn(*times.shape, action_dim, device=times.device)
-        drawn = MonteCarloSamples(times, noises, times.new_empty(times.shape))
-        losses = in_chunks(
-            lambda part: self.losses(part, policy.actor_features(part.observations)),
-            rollout._replace(drawn=drawn),
-        )
-        self.drawn = drawn._replace(reference_losses=losses)
-
-    def draw(self, rollout: FlowRolloutBufferSamples) -> MonteCarloSamples:  # noqa: ARG002
-        """The same samples in every epoch."""
-        return self.drawn
-
-    def losses(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> th.Tensor:
-        """Flow-matching losses of the actions at their times and noises, shape (n, k).
-
-        The noise that a velocity v stands for is x_t - t v: its error is t times the velocity's.
-
-        :param batch: n samples, with what was drawn for them.
-        :param features: The actor's features, shape (n, features_dim).
-        """
-        times, noises, _ = batch.drawn
-        actions = batch.actions.unsqueeze(1)
-        points = self.policy.flow.interpolant.interpolate(noises, actions, times)
-        velocity: th.Tensor = self.policy.velocity(points, times, features.unsqueeze(1))
-        error = velocity - (actions - noises)
-        if self.algorithm.loss_target == "epsilon":
-            error = times.unsqueeze(-1) * error
-        squares = error.square()
-        sums = self.algorithm.loss_reduction == "sum"
-        losses: th.Tensor = squares.sum(-1) if sums else squares.mean(-1)
-        clamp = self.algorithm.loss_clamp
-        return losses if clamp is None else losses.clamp(max=clamp)
-
-    def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
-        """Ratio from the change of the flow-matching loss (FPO, equation of the ratio)."""
-        losses = self.losses(batch, features)
-        log_ratio = batch.drawn.reference_losses - losses
-        clamp = self.algorithm.difference_clamp
-        if clamp is not None:
-            log_ratio = log_ratio.clamp(-clamp, clamp)
-        if self.algorithm.mc_average == "loss":
-            log_ratio = log_ratio.mean(dim=1)
-        # Entropy of the actions, from samples
-        regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
-        metrics["flow_matching_loss"] = losses.mean()
-        return PolicyTerms(log_ratio, ratio_divergence(log_ratio), regularizer, metrics)

@@ -33,87 +33,6 @@ from sb3_policyflow.policyflow.policies import (
 from sb3_policyflow.policyflow.uniform import UniformTargets, check_regularizers
 
 
-class PolicyFlow(FlowOnPolicyAlgorithm):
-    """On-policy learning with continuous-normalizing-flow policies.
-
-    Paper: PolicyFlow: Policy Optimization with Continuous Normalizing Flow in Reinforcement
-    Learning (ICLR 2026), https://arxiv.org/abs/2602.01156
-
-    PPO's update, with an importance ratio of the Gaussian noise around a flow's end point. The
-    shift of the end point is estimated from the change of the velocity at points between latent and
-    end point. An entropy regularizer lets the flow spread as Brownian motion would.
-
-    Takes the arguments of SB3's PPO with its names, order and defaults, those of
-    :class:`~sb3_policyflow.common.algorithm.FlowOnPolicyAlgorithm`, the options of
-    :class:`~sb3_policyflow.policyflow.PolicyFlowPolicy`, and:
-
-    :param brownian_coef: w_b, weight of the Brownian regularizer: a constant, "lin_START",
-        "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
-        entropy of the Gaussian noise and takes the same forms.
-    :param time_sampler: Times of the update: "grid" (the solver's own), "grid_without_end" or
-        "uniform".
-    :param n_times: Times for each sample.
-    :param time_average: With several times, whether each has its own surrogate ("objective") or
-        their mean shift makes one ("shift").
-    :param brownian_reduction: "sum" over action dimensions, or their "mean".
-    :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
-        regularizer (Ding et al., 2024). Takes the forms of ``brownian_coef``.
-    :param log_ratio_clamp: Log ratios beyond it have no gradient and do not overflow; None for no
-        bound. ``train/log_ratio_max`` is the greatest one before the clamp.
-    :raises ValueError: If an argument cannot be used.
-    """
-
-    policy_base = PolicyFlowPolicy
-    policy: PolicyFlowPolicy
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = policy_aliases(
-        MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
-    )
-    former_names: ClassVar[Mapping[str, str]] = {**FORMER_NAMES, "path": "interpolant"}
-    divergence_advice = ", or keep log_std_bounds of the noise away from zero"
-    option_checks: ClassVar[Mapping[str, checks.Check]] = {
-        "brownian_coef": parse_schedule,
-        "time_sampler": checks.one_of(TIME_SAMPLERS),
-        "n_times": checks.at_least(1),
-        "time_average": checks.one_of(("objective", "shift")),
-        "brownian_reduction": checks.one_of(("sum", "mean")),
-        "uniform_noise_coef": parse_schedule,
-        "log_ratio_clamp": checks.positive_or_none,
-    }
-    model_checks = (check_regularizers,)
-
-    @shares_options(FlowOnPolicyAlgorithm, PolicyFlowPolicy, former_names)
-    def __init__(
-        self,
-        policy: str | type[PolicyFlowPolicy],
-        env: GymEnv | str,
-        *args: Any,
-        brownian_coef: Coefficient = 0.0,
-        time_sampler: str = "grid",
-        n_times: int = 1,
-        time_average: str = "objective",
-        brownian_reduction: str = "sum",
-        uniform_noise_coef: Coefficient = 0.0,
-        log_ratio_clamp: float | None = None,
-        **options: Unpack[PolicyFlowOptions],
-    ) -> None:
-        self.brownian_coef = brownian_coef
-        self.time_sampler = time_sampler
-        self.n_times = n_times
-        self.time_average = time_average
-        self.brownian_reduction = brownian_reduction
-        self.uniform_noise_coef = uniform_noise_coef
-        self.log_ratio_clamp = log_ratio_clamp
-        super().__init__(policy, env, *args, **options)
-
-    @property
-    def n_evaluations_per_sample(self) -> int:
-        """Evaluations of the velocity for one sample in one gradient step, with the reference's."""
-        return 2 * self.n_times
-
-    def _begin_update(self, rollout: FlowRolloutBufferSamples) -> "PolicyFlowUpdate":
-        return PolicyFlowUpdate(self, rollout)
-
-
 class PathSamples(NamedTuple):
     """Where velocities are compared, for n samples and k times each.
 
@@ -133,7 +52,8 @@ class PolicyFlowUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
-    def __init__(self, algorithm: PolicyFlow, rollout: FlowRolloutBufferSamples) -> None:
+    def __init__(self, algorithm: "PolicyFlow", rollout: FlowRolloutBufferSamples) -> None:
+        super().__init__(algorithm, rollout)
         self.policy = policy = algorithm.policy
         self.flow = policy.flow
         # Line 3: the reference policy, theta-hat and sigma-hat. Its features are extracted once.
@@ -143,7 +63,6 @@ class PolicyFlowUpdate(FlowUpdate):
         self.time_sampler = TIME_SAMPLERS[algorithm.time_sampler](self.flow.times())
         self.n_times = algorithm.n_times
         self.time_average = algorithm.time_average
-        self.clip_range = algorithm.value_of("clip_range")
         self.log_ratio_clamp = algorithm.log_ratio_clamp
         self.brownian_coef = algorithm.value_of("brownian_coef")  # w_b
         self.brownian_reduction = algorithm.brownian_reduction
@@ -152,10 +71,10 @@ class PolicyFlowUpdate(FlowUpdate):
         has_targets = algorithm.uniform_noise_coef != 0.0
         self.uniform_targets = UniformTargets.of(policy) if has_targets else None
 
-    def draw(self, rollout: FlowRolloutBufferSamples) -> PathSamples:
+    def draw(self) -> PathSamples:
         """Times and points for each sample, with the reference velocity there."""
-        latents = rollout.record.latents.unsqueeze(1)
-        endpoints = rollout.record.endpoints.unsqueeze(1)
+        latents = self.rollout.record.latents.unsqueeze(1)
+        endpoints = self.rollout.record.endpoints.unsqueeze(1)
         # Lines 15 and 16: t from the solver's time grid, or uniform.
         times = self.time_sampler.sample(len(latents), self.n_times)
         # Line 17: the interpolation points x_t.
@@ -204,3 +123,82 @@ class PolicyFlowUpdate(FlowUpdate):
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)
         return over_actions.mean()
+
+
+class PolicyFlow(FlowOnPolicyAlgorithm):
+    """On-policy learning with continuous-normalizing-flow policies.
+
+    Paper: PolicyFlow: Policy Optimization with Continuous Normalizing Flow in Reinforcement
+    Learning (ICLR 2026), https://arxiv.org/abs/2602.01156
+
+    PPO's update, with an importance ratio of the Gaussian noise around a flow's end point. The
+    shift of the end point is estimated from the change of the velocity at points between latent and
+    end point. An entropy regularizer lets the flow spread as Brownian motion would.
+
+    Takes the arguments of SB3's PPO with its names, order and defaults, those of
+    :class:`~sb3_policyflow.common.algorithm.FlowOnPolicyAlgorithm`, the options of
+    :class:`~sb3_policyflow.policyflow.PolicyFlowPolicy`, and:
+
+    :param brownian_coef: w_b, weight of the Brownian regularizer: a constant, "lin_START",
+        "lin_START_END" or a function of the remaining progress. ``ent_coef``, w_g, weighs the
+        entropy of the Gaussian noise and takes the same forms.
+    :param time_sampler: Times of the update: "grid" (the solver's own), "grid_without_end" or
+        "uniform".
+    :param n_times: Times for each sample.
+    :param time_average: With several times, whether each has its own surrogate ("objective") or
+        their mean shift makes one ("shift").
+    :param brownian_reduction: "sum" over action dimensions, or their "mean".
+    :param uniform_noise_coef: Weight of flow matching towards uniform actions, another entropy
+        regularizer (Ding et al., 2024). Takes the forms of ``brownian_coef``.
+    :param log_ratio_clamp: Log ratios beyond it have no gradient and do not overflow; None for no
+        bound. ``train/log_ratio_max`` is the greatest one before the clamp.
+    :raises ValueError: If an argument cannot be used.
+    """
+
+    policy_base = PolicyFlowPolicy
+    update_class = PolicyFlowUpdate
+    policy: PolicyFlowPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = policy_aliases(
+        MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
+    )
+    former_names: ClassVar[Mapping[str, str]] = {**FORMER_NAMES, "path": "interpolant"}
+    divergence_advice = ", or keep log_std_bounds of the noise away from zero"
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "brownian_coef": parse_schedule,
+        "time_sampler": checks.one_of(TIME_SAMPLERS),
+        "n_times": checks.at_least(1),
+        "time_average": checks.one_of(("objective", "shift")),
+        "brownian_reduction": checks.one_of(("sum", "mean")),
+        "uniform_noise_coef": parse_schedule,
+        "log_ratio_clamp": checks.positive_or_none,
+    }
+    model_checks = (check_regularizers,)
+
+    @shares_options(FlowOnPolicyAlgorithm, PolicyFlowPolicy, former_names)
+    def __init__(
+        self,
+        policy: str | type[PolicyFlowPolicy],
+        env: GymEnv | str,
+        *args: Any,
+        brownian_coef: Coefficient = 0.0,
+        time_sampler: str = "grid",
+        n_times: int = 1,
+        time_average: str = "objective",
+        brownian_reduction: str = "sum",
+        uniform_noise_coef: Coefficient = 0.0,
+        log_ratio_clamp: float | None = None,
+        **options: Unpack[PolicyFlowOptions],
+    ) -> None:
+        self.brownian_coef = brownian_coef
+        self.time_sampler = time_sampler
+        self.n_times = n_times
+        self.time_average = time_average
+        self.brownian_reduction = brownian_reduction
+        self.uniform_noise_coef = uniform_noise_coef
+        self.log_ratio_clamp = log_ratio_clamp
+        super().__init__(policy, env, *args, **options)
+
+    @property
+    def n_evaluations_per_sample(self) -> int:
+        """Evaluations of the velocity for one sample in one gradient step, with the reference's."""
+        return 2 * self.n_times

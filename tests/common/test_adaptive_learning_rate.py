@@ -1,6 +1,6 @@
 import pytest
 
-from sb3_policyflow.common.schedules import KLAdaptiveLearningRate
+from sb3_policyflow.common.schedules import KLAdaptiveLearningRate, check_lr_adaptation
 
 RULE = KLAdaptiveLearningRate(bounds=(1e-4, 1e-3))
 
@@ -34,4 +34,4 @@ def test_rule(learning_rate: float, kl: float, expected: float) -> None:
 )
 def test_rules_that_cannot_work_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        KLAdaptiveLearningRate(**options)  # type: ignore[arg-type]
+        check_lr_adaptation("lr_adaptation_kwargs", options)

@@ -65,7 +65,7 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ),
         ({"lr_adaptation_kwargs": {"bounds": (0.0, 1e-3)}}, r"bounds must be positive"),
         ({"lr_adaptation_kwargs": {"factor": 0.5}}, r"factor must be greater than 1, got 0.5"),
-        ({"lr_adaptation_kwargs": {"margin": 0.5}}, r"margin must be a number from 1 to inf"),
+        ({"lr_adaptation_kwargs": {"margin": 0.5}}, r"margin must be a number from 1.0 to inf"),
         ({"max_grad_norm": float("nan")}, r"max_grad_norm must be a number"),
         ({"max_grad_norm": "a"}, r"max_grad_norm must be a number"),
         ({"target_kl": -1.0}, r"target_kl must be positive"),

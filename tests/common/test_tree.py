@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch as th
 
-from sb3_policyflow.common.tree import in_chunks, map_tensors, rows, size_in_bytes
+from sb3_policyflow.common.tree import in_chunks, map_tensors, rows, tensors
 
 
 class Record(NamedTuple):
@@ -33,7 +33,7 @@ def test_types_and_names_are_kept() -> None:
 )
 def test_what_holds_no_tensors_is_left_as_it_is(empty: Any) -> None:
     assert map_tensors(lambda values: values + 1, empty) == empty
-    assert size_in_bytes(empty) == 0
+    assert list(tensors(empty)) == []
 
 
 @pytest.mark.parametrize("other", [1.0, "a", None, [th.zeros(1)]], ids=str)
@@ -53,8 +53,8 @@ def test_rows_are_those_of_every_tensor(chosen: Any) -> None:
     assert th.equal(part["pair"][1], whole["pair"][1][chosen])
 
 
-def test_size_is_that_of_all_tensors() -> None:
-    assert size_in_bytes(tree(6)) == 6 * (4 + 3 * 8)
+def test_every_tensor_is_found() -> None:
+    assert sum(tensor.nbytes for tensor in tensors(tree(6))) == 6 * (4 + 3 * 8)
 
 
 @pytest.mark.parametrize("n", [1, 8192, 20_000])

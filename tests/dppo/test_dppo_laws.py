@@ -22,7 +22,7 @@ N_SAMPLES = 64
 
 def terms(model: DPPO, batch: FlowRolloutBufferSamples) -> Any:
     features = model.policy.actor_features(batch.observations)
-    return DPPOUpdate(model).terms(batch, features)
+    return DPPOUpdate(model, batch).terms(batch, features)
 
 
 @pytest.mark.parametrize("process", ["ddpm", "flow"])
@@ -52,9 +52,9 @@ def test_log_prob_of_the_chain_is_that_of_its_gaussians(process: str) -> None:
             mean = policy.chain.means(points, outputs, step)
             std = max(policy.chain.stds[step].item(), 0.1)
             expected += Normal(mean, std).log_prob(record.points[:, step + 1]).sum(-1)
-    log_probs = DPPOUpdate(model).log_probs(record, means)
+    log_probs = DPPOUpdate(model, rollout).log_probs(record, means)
     th.testing.assert_close(log_probs.sum(-1), expected, atol=1e-3, rtol=1e-4)
-    old = DPPOUpdate(model).log_probs(record, record.means)
+    old = DPPOUpdate(model, rollout).log_probs(record, record.means)
     th.testing.assert_close(terms(model, rollout).log_ratio, log_probs - old)
 
 
@@ -89,20 +89,22 @@ def test_divergence_is_that_of_the_steps() -> None:
 
 
 def test_log_probs_are_clamped_before_they_are_reduced() -> None:
-    model, _ = collected(DPPO, process="flow", n_denoising_steps=1)
+    model, rollout = collected(DPPO, process="flow", n_denoising_steps=1)
     means = th.zeros(1, 1, 2)
     points = th.stack([th.zeros(1, 2), th.tensor([[0.0, 9.0]])], dim=1)
     # log N(0; 0, 0.1^2) = 1.38 stays, that of 9 is far below -5.
     record = DPPORecord(points, means)
     expected = (Normal(0.0, 0.1).log_prob(th.tensor(0.0)).item() - 5) / 2
-    assert DPPOUpdate(model).log_probs(record, means).item() == pytest.approx(expected, rel=1e-5)
+    assert DPPOUpdate(model, rollout).log_probs(record, means).item() == pytest.approx(
+        expected, rel=1e-5
+    )
 
 
 def test_later_steps_weigh_more_and_are_clipped_later() -> None:
-    model, _ = collected(
+    model, rollout = collected(
         DPPO, denoising_gamma=0.5, clip_range_base=0.01, clip_range=0.2, n_denoising_steps=3
     )
-    update = DPPOUpdate(model)
+    update = DPPOUpdate(model, rollout)
     clip_ranges = update.clip_range
     assert isinstance(clip_ranges, th.Tensor)
     middle = 0.01 + 0.19 * (np.exp(1.5) - 1) / (np.exp(3) - 1)
@@ -113,8 +115,8 @@ def test_later_steps_weigh_more_and_are_clipped_later() -> None:
 
 
 def test_a_single_step_has_the_last_clip_range() -> None:
-    model, _ = collected(DPPO, clip_range_base=0.01, n_denoising_steps=1)
-    assert float(DPPOUpdate(model).clip_range) == pytest.approx(0.2)
+    model, rollout = collected(DPPO, clip_range_base=0.01, n_denoising_steps=1)
+    assert float(DPPOUpdate(model, rollout).clip_range) == pytest.approx(0.2)
 
 
 def test_only_the_last_steps_are_trained() -> None:

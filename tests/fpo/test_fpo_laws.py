@@ -17,7 +17,7 @@ from tests.helpers import collected, perturb
 def with_draws(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
     """A model with a rollout and what its first epoch draws."""
     model, rollout = collected(FPO, **options)
-    return model, rollout._replace(drawn=FPOUpdate(model, rollout).draw(rollout))
+    return model, rollout._replace(drawn=FPOUpdate(model, rollout).draw())
 
 
 def log_ratio(model: FPO, batch: FlowRolloutBufferSamples) -> th.Tensor:

@@ -74,7 +74,7 @@ def test_features_extractors(policy: str, request: pytest.FixtureRequest) -> Non
         th.manual_seed(0)
         rollout = model.rollout_buffer.samples()
         update = PolicyFlowUpdate(model, rollout)
-        rollout = rollout._replace(drawn=update.draw(rollout))
+        rollout = rollout._replace(drawn=update.draw())
         features, critic_features = model.policy.actor_critic_features(rollout.observations)
         terms = update.terms(rollout, features)
         loss = update.surrogate_loss(terms.log_ratio, rollout.advantages, UpdateMetrics())

@@ -43,7 +43,7 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
         old = gaussian()
         rollout = rollout._replace(actions=actions, record=record)
         update = PolicyFlowUpdate(model, rollout)
-        drawn = update.draw(rollout)
+        drawn = update.draw()
         perturb(policy, 0.05)
         terms = update.terms(rollout._replace(drawn=drawn), features)
         new = gaussian()

@@ -65,7 +65,7 @@ def sample_batch(
         record=record,
     )
     update = PolicyFlowUpdate(model, batch)
-    return batch._replace(drawn=update.draw(batch)), features, update
+    return batch._replace(drawn=update.draw()), features, update
 
 
 @pytest.mark.parametrize("interpolant", ["rectified", "stochastic", "trigflow"])
@@ -106,7 +106,7 @@ def test_trigflow_shifts_by_half_pi_times_the_mean_velocity_change() -> None:
         model.policy.velocity.output.weight.zero_()
         before = model.policy.transport(batch.record.latents, features)
         update = PolicyFlowUpdate(model, batch)
-        batch = batch._replace(drawn=update.draw(batch))
+        batch = batch._replace(drawn=update.draw())
         model.policy.velocity.output.bias += change
         true_shift = model.policy.transport(batch.record.latents, features) - before
     terms = update.terms(batch, features)
@@ -123,7 +123,8 @@ def test_equals_gaussian_ppo_when_the_reference_velocity_and_the_latents_are_zer
     batch, features, update = sample_batch(model)
     zeros = th.zeros_like(batch.actions)
     batch = batch._replace(record=PolicyFlowRecord(zeros, zeros), actions=th.randn_like(zeros))
-    batch = batch._replace(drawn=update.draw(batch))
+    update = PolicyFlowUpdate(model, batch)
+    batch = batch._replace(drawn=update.draw())
     perturb(model.policy, 0.05)
     advantages, parameters = batch.advantages, actor_parameters(model)
 
