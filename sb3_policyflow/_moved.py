@@ -51,7 +51,7 @@ MOVED = {
     "fused": "kernels",
     "startup": "integrations.rl_zoo3.startup",
     "zoo": "integrations.rl_zoo3",
-    "zoo.vector": "integrations.rl_zoo3.vec_env",
+    "zoo.vector": "envs.native",
 }
 """New names by old ones, within this package; those of packages hold for the modules in them."""
 

@@ -5,6 +5,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+
 SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1, "seed": 0}
 """Options of the smallest run that has two minibatches."""
 TWO_EPOCHS: dict[str, Any] = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 0}
@@ -65,9 +67,24 @@ def collect(model: Any) -> Any:
     """
     total_timesteps = model.n_steps * model.n_envs
     # SB3 starts an environment in ``learn`` alone.
-    _, callback = model._setup_learn(total_timesteps)
+    _, callback = model._setup_learn(total_timesteps, reset_num_timesteps=False)
     assert model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
     return model
+
+
+def collected(algorithm: type[Any], **options: Any) -> tuple[Any, FlowRolloutBufferSamples]:
+    """A model whose velocity is not zero, and a rollout of the policy that it now has.
+
+    :param algorithm: Its class.
+    :param options: Options of the model, whose rollouts have 64 samples.
+    :return: The model, in evaluation mode, and the rollout.
+    """
+    sizes = {"n_steps": 64, "batch_size": 16, "n_epochs": 1, "seed": 0}
+    policy_kwargs = {"initialization": "glorot"}
+    model = algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, **sizes, **options)
+    collect(model.learn(64))
+    model.policy.set_training_mode(False)
+    return model, model.rollout_buffer.samples()
 
 
 def n_updates(model: Any) -> int:

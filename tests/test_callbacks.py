@@ -16,13 +16,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.callbacks import FlowDiagnosticsCallback, end_point_shifts
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from tests.helpers import SMALL, weights
 
-SMALL: dict[str, Any] = {
+OPTIONS: dict[str, Any] = {
+    **SMALL,
     "n_steps": 32,
     "batch_size": 128,
     "n_epochs": 2,
     "n_flow_steps": 4,
-    "seed": 0,
 }
 
 
@@ -46,7 +47,7 @@ def environment() -> VecEnv:
 
 
 def diagnosed(iterations: int = 3, every: int = 1, **options: Any) -> list[dict[str, float]]:
-    model = PolicyFlow("MlpPolicy", environment(), **{**SMALL, **options})
+    model = PolicyFlow("MlpPolicy", environment(), **{**OPTIONS, **options})
     collector = Collector()
     diagnostics = FlowDiagnosticsCallback(every=every, n_samples=200)
     model.learn(iterations * 256, [diagnostics, collector])
@@ -66,8 +67,8 @@ def test_small_updates_are_approximated_well_and_large_ones_worse() -> None:
 def test_training_is_the_same_with_and_without() -> None:
     runs = []
     for callback in (None, FlowDiagnosticsCallback(n_samples=16)):
-        model = PolicyFlow("MlpPolicy", environment(), **SMALL).learn(512, callback)
-        runs.append(th.cat([parameter.flatten() for parameter in model.policy.parameters()]))
+        model = PolicyFlow("MlpPolicy", environment(), **OPTIONS).learn(512, callback)
+        runs.append(weights(model))
     assert th.equal(*runs)
 
 
@@ -79,7 +80,7 @@ def test_every_so_many_rollouts() -> None:
 
 
 def test_the_last_update_is_logged_too(tmp_path: Path) -> None:
-    model = PolicyFlow("MlpPolicy", environment(), **SMALL)
+    model = PolicyFlow("MlpPolicy", environment(), **OPTIONS)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(2 * 256, FlowDiagnosticsCallback(n_samples=16))
     log = pd.read_csv(tmp_path / "progress.csv")
@@ -91,7 +92,7 @@ def test_the_last_update_is_logged_too(tmp_path: Path) -> None:
 def test_shifts_of_constant_fields(interpolant: str) -> None:
     """A field that is constant in space and time moves all ends by its change times the length."""
     old, new = (
-        PolicyFlow("MlpPolicy", environment(), interpolant=interpolant, **SMALL).learn(256)
+        PolicyFlow("MlpPolicy", environment(), interpolant=interpolant, **OPTIONS).learn(256)
         for _ in range(2)
     )
     for model, constant in ((old, 1.0), (new, 3.0)):
@@ -108,7 +109,7 @@ def test_shifts_of_constant_fields(interpolant: str) -> None:
 
 def test_entropy_of_a_policy_that_is_gaussian() -> None:
     """With a velocity of zero, an action is a latent plus noise, both of variance 1."""
-    model = PolicyFlow("MlpPolicy", environment(), **{**SMALL, "learning_rate": 0.0})
+    model = PolicyFlow("MlpPolicy", environment(), **{**OPTIONS, "learning_rate": 0.0})
     collector = Collector()
     diagnostics = FlowDiagnosticsCallback(n_entropy_states=64, n_entropy_actions=256)
     model.learn(512, [diagnostics, collector])
@@ -121,9 +122,9 @@ def test_entropy_of_a_policy_that_is_gaussian() -> None:
 def test_other_algorithms(algorithm: type[Any]) -> None:
     runs = []
     for callbacks in ([], [FlowDiagnosticsCallback(n_samples=16), Collector()]):
-        options = {name: value for name, value in SMALL.items() if name != "n_flow_steps"}
+        options = {name: value for name, value in OPTIONS.items() if name != "n_flow_steps"}
         model = algorithm("MlpPolicy", environment(), **options).learn(512, callbacks)
-        runs.append(th.cat([parameter.flatten() for parameter in model.policy.parameters()]))
+        runs.append(weights(model))
     assert list(callbacks[1].logged[-1]) == ["action_entropy"]
     assert th.equal(*runs)
 

@@ -227,19 +227,16 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
                 features, critic_features = self.policy.actor_critic_features(batch.observations)
-                terms = update.terms(batch, features)  # lines 18, 20 and 21
-                # Surrogate objective within the trust region
+                terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
                 advantages = self._normalized(batch.advantages, "minibatch")
                 policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
-                # Value loss, against the TD(lambda) returns
+                # Squared error of the values against the TD(lambda) returns
                 values = self.policy.values(critic_features).flatten()
                 value_loss = clipped_value_loss(
                     values, batch.old_values, batch.returns, clip_range_vf
                 )
-                # The entropy bonuses are part of the regularizer
+                metrics.add_means({"value_loss": value_loss, **terms.metrics})
                 loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
-                metrics.add_means({"policy_gradient_loss": policy_loss, "value_loss": value_loss})
-                metrics.add_means(terms.metrics)
                 kls.append(terms.kl.detach())
                 stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
                 if not stop:

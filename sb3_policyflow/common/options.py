@@ -106,11 +106,16 @@ def shares_options(
 
     def complete(init: Callable[P, None]) -> Callable[P, None]:
         signature = _complete_signature(init, base, policy_class, defaults)
+        names = {option.name for option in own_options(policy_class)}
 
         @functools.wraps(init)
         def completed(*args: Any, **options: Any) -> None:
             options = with_present_names(options, former_names)
             given = signature.bind(*args, **options).arguments
+            twice = sorted(names & given.keys() & (given.get("policy_kwargs") or {}).keys())
+            if twice:
+                name = type(given["self"]).__name__
+                raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
             cast("Callable[..., None]", init)(**{**defaults, **given})
 
         completed.__signature__ = signature  # type: ignore[attr-defined]  # inspect looks here
@@ -218,9 +223,6 @@ def check_algorithm(model: Any) -> None:
     checks.check_environment(name, model.env, space)
     checks.check_flow_spaces(model.action_space, model.use_sde)
     checks.check_policy_class(name, model.policy_class, model.policy_base)
-    twice = sorted(model.policy_options.keys() & model.policy_kwargs.keys())
-    if twice:
-        raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
     checks.check_options(model)
     checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
     if model.desired_kl is None:

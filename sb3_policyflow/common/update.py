@@ -64,7 +64,7 @@ class FlowUpdate(ABC):
 
         :param log_ratio: log rho, shape (n, ...), with one entry for each surrogate.
         :param advantages: A, shape (n,).
-        :param metrics: Takes what is to be logged of the ratios.
+        :param metrics: Takes the loss and what is to be logged of the ratios.
         :return: The mean over samples and surrogates, a tensor without dimensions.
         """
         metrics.add_maxima({"log_ratio_max": log_ratio.detach().abs().max()})
@@ -76,8 +76,15 @@ class FlowUpdate(ABC):
             objective = self.surrogate_weights * objective
         ratio = log_ratio.detach().exp()
         is_clipped = (ratio - 1).abs() > self.clip_range
-        metrics.add_means({"clip_fraction": is_clipped.float().mean(), "ratio_mean": ratio.mean()})
-        return -objective.mean()
+        loss = -objective.mean()
+        metrics.add_means(
+            {
+                "policy_gradient_loss": loss,
+                "clip_fraction": is_clipped.float().mean(),
+                "ratio_mean": ratio.mean(),
+            }
+        )
+        return loss
 
 
 class UpdateMetrics:

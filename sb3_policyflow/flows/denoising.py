@@ -1,6 +1,6 @@
 """Markov chains from noise to data, whose steps are Gaussian around what a network predicts.
 
-Steps count from 0, the noisiest, to K - 1, which ends at the data: x_K = data, x_0 ~ N(0, I).
+Steps are numbered from 0, the noisiest, to K - 1: x_0 ~ N(0, I), and x_K is the data.
 """
 
 import math
@@ -16,8 +16,7 @@ Steps = int | slice
 class DenoisingProcess(nn.Module):
     """A chain x_{k+1} ~ N(m_k(x_k), s_k^2 I) for k = 0 ... K - 1.
 
-    ``times`` (K,) are those at which the network is asked, 0 at the noise and below 1; ``stds``
-    (K,) are s_k.
+    ``times`` (K,) are the network's time inputs, 0 at the noise and below 1; ``stds`` (K,) are s_k.
     """
 
     times: th.Tensor
@@ -64,8 +63,8 @@ class DDPM(DenoisingProcess):
         super().__init__(n_steps)
         self.data_clip = data_clip
         self.identity_skip = identity_skip
-        retained = cosine_retained(n_steps)
-        before, after = retained[:-1], retained[1:]  # of x_k, and of the less noisy x_{k+1}
+        alpha_bar = cosine_alpha_bar(n_steps)
+        before, after = alpha_bar[:-1], alpha_bar[1:]  # of x_k, and of the less noisy x_{k+1}
         alpha = before / after
         self._keep("stds", ((1 - alpha) * (1 - after) / (1 - before)).sqrt())
         self._keep("_point_to_data", before.rsqrt())
@@ -90,7 +89,7 @@ class DDPM(DenoisingProcess):
 class EulerChain(DenoisingProcess):
     """Euler steps of a flow, for noise of a fixed standard deviation around each.
 
-    m_k = x_k + v_k / K,    s_k = 0: all noise is the floor that its user sets
+    m_k = x_k + v_k / K,    s_k = 0: the policy's least standard deviation is all the noise
     """
 
     def __init__(self, n_steps: int) -> None:
@@ -102,16 +101,16 @@ class EulerChain(DenoisingProcess):
         return points + outputs / self.n_steps
 
 
-def cosine_retained(n_steps: int, offset: float = 0.008, largest_beta: float = 0.999) -> th.Tensor:
-    """abar, the share of the data's variance that is left, from x_0 to x_K.
+def cosine_alpha_bar(n_steps: int, offset: float = 0.008, largest_beta: float = 0.999) -> th.Tensor:
+    """The cosine schedule's alpha-bar, the product of all 1 - beta, from x_0 to x_K.
 
-    abar falls as cos^2(pi / 2 (u + offset) / (1 + offset)) with the noise level u from 0 to 1, by
-    a factor 1 - beta of at least 1 - largest_beta a step (Nichol and Dhariwal, 2021).
+    alpha-bar falls as cos^2(pi / 2 (u + offset) / (1 + offset)) with the noise level u from 0 to 1;
+    each step's factor 1 - beta is at least 1 - largest_beta (Nichol and Dhariwal, 2021).
 
-    >>> [round(share, 5) for share in cosine_retained(2).tolist()]
+    >>> [round(value, 5) for value in cosine_alpha_bar(2).tolist()]
     [0.00049, 0.49384, 1.0]
 
-    :return: Shape (n_steps + 1,), float64; the last one, of the data themselves, is 1.
+    :return: Shape (n_steps + 1,), float64; the last one, that of the data, is 1.
     """
     levels = th.linspace(0, 1, n_steps + 1, dtype=th.float64)
     wanted = (0.5 * math.pi * (levels + offset) / (1 + offset)).cos().square()

@@ -30,21 +30,7 @@ from sb3_policyflow.policyflow.policies import (
     PolicyFlowOptions,
     PolicyFlowPolicy,
 )
-from sb3_policyflow.policyflow.uniform import UniformTargets
-
-
-def check_regularizers(model: "PolicyFlow") -> None:
-    """Refuse regularizers that the policy cannot have.
-
-    :raises ValueError: If there is no flow, or one that is stochastic, for them to act on.
-    """
-    if model.policy.gaussian and (model.brownian_coef, model.uniform_noise_coef) != (0.0, 0.0):
-        raise ValueError(
-            "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
-            "and uniform_noise_coef at 0, and use ent_coef."
-        )
-    if model.uniform_noise_coef != 0.0:
-        UniformTargets.of(model.policy)
+from sb3_policyflow.policyflow.uniform import UniformTargets, check_regularizers
 
 
 class PolicyFlow(FlowOnPolicyAlgorithm):

@@ -1,5 +1,7 @@
 """Flow matching towards uniform actions, as an entropy regularizer."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 
@@ -56,3 +58,18 @@ class UniformTargets:
         target = self._interpolant.derivative(latents, uniform, times)
         error: th.Tensor = velocity(points, times, features) - target
         return error.square().sum(-1).mean()
+
+
+def check_regularizers(model: Any) -> None:
+    """Refuse regularizers that the policy cannot have.
+
+    :param model: A PolicyFlow.
+    :raises ValueError: If there is no flow, or one that is stochastic, for them to act on.
+    """
+    if model.policy.gaussian and (model.brownian_coef, model.uniform_noise_coef) != (0.0, 0.0):
+        raise ValueError(
+            "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
+            "and uniform_noise_coef at 0, and use ent_coef."
+        )
+    if model.uniform_noise_coef != 0.0:
+        UniformTargets.of(model.policy)

@@ -14,6 +14,7 @@ from sb3_policyflow.benchmark.measure.visits import VisitMap
 from sb3_policyflow.envs.point_maze import ENV_ID
 
 
+@pytest.mark.slow
 def test_command(tmp_path: Path) -> None:
     """Two seeds of two variants, hardly trained; a second call only draws."""
     command = [sys.executable, "-m", "sb3_policyflow.benchmark", "pointmaze", "--out", tmp_path]

@@ -46,6 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_what_is_written(folder: Path) -> None:
     files = sorted(str(path.relative_to(folder)) for path in folder.glob("*/*/*"))
     names = [f"Pendulum-v1/seed-0.{suffix}" for suffix in ("csv", "json")]
@@ -66,6 +67,7 @@ def test_what_is_written(folder: Path) -> None:
     assert -2000 < ppo.final_return("deterministic") < 0  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
     before = (folder / "ppo/Pendulum-v1/seed-0.json").stat().st_mtime_ns
     # What a killed run leaves behind does not count.
@@ -76,6 +78,7 @@ def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
     assert len(load_results(folder)) == 3
 
 
+@pytest.mark.slow
 def test_hyperparams_of_the_command(tmp_path: Path) -> None:
     settings = ["--hyperparams", "n_envs:2", "n_steps:8", "policy_kwargs:'dict(net_arch=[4])'"]
     outcome = run(tmp_path, "policyflow", "ppo", *settings)
@@ -100,12 +103,14 @@ def test_a_falling_learning_rate_ends_at_zero_not_below() -> None:
     assert min(remaining) == 0
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--algos", "fpo", "--envs", "Pendulum-v1", "--steps", "11", "--out", str(folder)]
     assert main(["run", *settings]) == 2
     assert "was made with other settings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_failing_run_is_reported_and_its_log_kept(tmp_path: Path) -> None:
     outcome = run(tmp_path, "fpo", "--hyperparams", "n_steps:-1")
     assert outcome.returncode == 1
@@ -115,6 +120,7 @@ def test_a_failing_run_is_reported_and_its_log_kept(tmp_path: Path) -> None:
     assert log.endswith("exit code 1\n")
 
 
+@pytest.mark.slow
 def test_a_figure_says_what_failed_though_there_is_nothing_to_draw(tmp_path: Path) -> None:
     settings = ["--steps", "10", "--variants", "a-ppo", "--out", str(tmp_path)]
     # No evaluation after -1 episodes: the training fails.
@@ -182,6 +188,7 @@ def test_there_is_no_curve_of_seeds_that_were_evaluated_at_different_timesteps()
         curves_figure([curve(0, 50, 100), curve(1, 500, 1000)])
 
 
+@pytest.mark.slow
 def test_table_and_plot(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["table", str(folder), "--out", str(tmp_path / "table.md")]) == 0
     assert capsys.readouterr().out == f"Wrote {tmp_path / 'table.md'}.\n"

@@ -15,30 +15,9 @@ from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.dppo.dppo import DPPOUpdate
 from sb3_policyflow.dppo.policies import DPPORecord
+from tests.helpers import collected, perturb
 
 N_SAMPLES = 64
-
-
-def collected(**options: Any) -> tuple[DPPO, FlowRolloutBufferSamples]:
-    """A model with a rollout in its buffer."""
-    model = DPPO(
-        "MlpPolicy",
-        "Pendulum-v1",
-        n_steps=N_SAMPLES,
-        batch_size=16,
-        n_epochs=1,
-        seed=0,
-        policy_kwargs={"initialization": "glorot"},
-        **options,
-    )
-    model.learn(N_SAMPLES)
-    model.collect_rollouts(
-        model.get_env(),  # type: ignore[arg-type]
-        model._init_callback(None),
-        model.rollout_buffer,
-        N_SAMPLES,
-    )
-    return model, model.rollout_buffer.samples()
 
 
 def terms(model: DPPO, batch: FlowRolloutBufferSamples) -> Any:
@@ -46,16 +25,10 @@ def terms(model: DPPO, batch: FlowRolloutBufferSamples) -> Any:
     return DPPOUpdate(model).terms(batch, features)
 
 
-def perturb(model: DPPO, scale: float = 0.02) -> None:
-    with th.no_grad():
-        for parameter in model.policy.velocity.parameters():
-            parameter += scale * th.randn_like(parameter)
-
-
 @pytest.mark.parametrize("process", ["ddpm", "flow"])
 @pytest.mark.parametrize("reduction", ["mean", "sum"])
 def test_log_ratios_are_zero_at_equal_weights(process: str, reduction: str) -> None:
-    model, rollout = collected(process=process, log_prob_reduction=reduction)
+    model, rollout = collected(DPPO, process=process, log_prob_reduction=reduction)
     for batch in model.rollout_buffer.minibatches(rollout, 16):
         result = terms(model, batch)
         assert result.log_ratio.shape == (16, 10)
@@ -65,9 +38,9 @@ def test_log_ratios_are_zero_at_equal_weights(process: str, reduction: str) -> N
 
 @pytest.mark.parametrize("process", ["ddpm", "flow"])
 def test_log_prob_of_the_chain_is_that_of_its_gaussians(process: str) -> None:
-    model, rollout = collected(process=process, log_prob_clamp=None, log_prob_reduction="sum")
+    model, rollout = collected(DPPO, process=process, log_prob_clamp=None, log_prob_reduction="sum")
     record: DPPORecord = rollout.record
-    perturb(model)
+    perturb(model.policy.velocity, 0.02)
     policy = model.policy
     with th.no_grad():
         features = policy.actor_features(rollout.observations)
@@ -87,13 +60,13 @@ def test_log_prob_of_the_chain_is_that_of_its_gaussians(process: str) -> None:
 
 def test_one_step_is_a_gaussian_policy_at_the_floor_std() -> None:
     options = {"n_denoising_steps": 1, "log_prob_clamp": None, "log_prob_reduction": "sum"}
-    model, rollout = collected(min_sampling_std=0.3, min_log_prob_std=0.3, **options)
+    model, rollout = collected(DPPO, min_sampling_std=0.3, min_log_prob_std=0.3, **options)
     record: DPPORecord = rollout.record
     assert model.policy.chain.stds.tolist() == [0.0]
     noise = record.points[:, 1] - record.means[:, 0]
     assert noise.std().item() == pytest.approx(0.3, rel=0.25)
     th.testing.assert_close(rollout.actions, record.points[:, 1].clamp(-1, 1))
-    perturb(model)
+    perturb(model.policy.velocity, 0.02)
     with th.no_grad():
         features = model.policy.actor_features(rollout.observations)
         means = model.policy.trained_means(record.points[:, :1], features)[:, 0]
@@ -104,8 +77,8 @@ def test_one_step_is_a_gaussian_policy_at_the_floor_std() -> None:
 
 
 def test_divergence_is_that_of_the_steps() -> None:
-    model, rollout = collected()
-    perturb(model)
+    model, rollout = collected(DPPO)
+    perturb(model.policy.velocity, 0.02)
     record, policy = rollout.record, model.policy
     with th.no_grad():
         features = policy.actor_features(rollout.observations)
@@ -116,7 +89,7 @@ def test_divergence_is_that_of_the_steps() -> None:
 
 
 def test_log_probs_are_clamped_before_they_are_reduced() -> None:
-    model, _ = collected(process="flow", n_denoising_steps=1)
+    model, _ = collected(DPPO, process="flow", n_denoising_steps=1)
     means = th.zeros(1, 1, 2)
     points = th.stack([th.zeros(1, 2), th.tensor([[0.0, 9.0]])], dim=1)
     # log N(0; 0, 0.1^2) = 1.38 stays, that of 9 is far below -5.
@@ -127,7 +100,7 @@ def test_log_probs_are_clamped_before_they_are_reduced() -> None:
 
 def test_later_steps_weigh_more_and_are_clipped_later() -> None:
     model, _ = collected(
-        denoising_gamma=0.5, clip_range_base=0.01, clip_range=0.2, n_denoising_steps=3
+        DPPO, denoising_gamma=0.5, clip_range_base=0.01, clip_range=0.2, n_denoising_steps=3
     )
     update = DPPOUpdate(model)
     clip_ranges = update.clip_range
@@ -140,12 +113,12 @@ def test_later_steps_weigh_more_and_are_clipped_later() -> None:
 
 
 def test_a_single_step_has_the_last_clip_range() -> None:
-    model, _ = collected(clip_range_base=0.01, n_denoising_steps=1)
+    model, _ = collected(DPPO, clip_range_base=0.01, n_denoising_steps=1)
     assert float(DPPOUpdate(model).clip_range) == pytest.approx(0.2)
 
 
 def test_only_the_last_steps_are_trained() -> None:
-    model, rollout = collected(n_finetuned_steps=4)
+    model, rollout = collected(DPPO, n_finetuned_steps=4)
     assert rollout.record.means.shape == (N_SAMPLES, 4, 1)
     frozen = [value.clone() for value in model.policy.base_velocity.state_dict().values()]
     model.train()
@@ -199,7 +172,7 @@ def test_the_critic_warms_up_without_the_extractor_of_the_actor(share: bool) -> 
 
 
 def test_warming_up_takes_rollouts_however_long_their_updates() -> None:
-    model, _ = collected(n_critic_warmup=2)
+    model, _ = collected(DPPO, n_critic_warmup=2)
     model.n_epochs = 4
     untrained = model.policy.velocity.output.weight.clone()
     model.train()

@@ -3,13 +3,13 @@
 import pytest
 import torch as th
 
-from sb3_policyflow.flows.denoising import DDPM, EulerChain, cosine_retained
+from sb3_policyflow.flows.denoising import DDPM, EulerChain, cosine_alpha_bar
 from sb3_policyflow.flows.solvers import integrate
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 10, 50])
 def test_share_of_the_data_rises_to_one(n_steps: int) -> None:
-    retained = cosine_retained(n_steps)
+    retained = cosine_alpha_bar(n_steps)
     assert retained.shape == (n_steps + 1,)
     assert (retained.diff() > 0).all()
     assert retained[-1].item() == 1.0
@@ -20,7 +20,7 @@ def test_share_of_the_data_rises_to_one(n_steps: int) -> None:
 def test_a_step_is_the_posterior_of_the_forward_process(n_steps: int) -> None:
     """Bayes' rule for x_{k+1} given x_k and the data, with precisions added up by hand."""
     process = DDPM(n_steps, data_clip=10.0, identity_skip=False)
-    retained = cosine_retained(n_steps)
+    retained = cosine_alpha_bar(n_steps)
     for step in range(n_steps - 1):
         before, after = retained[step], retained[step + 1]
         alpha = before / after

@@ -99,6 +99,7 @@ def test_no_steps_are_refused(n_steps: int) -> None:
 
 def test_unknown_solver_is_refused_with_the_choices() -> None:
     with pytest.raises(
-        ValueError, match=r"solver must be one of 'euler', 'midpoint'.*got 'newton'"
+        ValueError,
+        match=r"solver must be one of 'euler', 'midpoint', 'heun', 'rk4', 'ab2', got 'newton'",
     ):
         integrate(swirl, LATENTS, solver="newton")

@@ -11,23 +11,12 @@ from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.tree import rows
 from sb3_policyflow.fpo.fpo import FPOUpdate, MonteCarloSamples
 from sb3_policyflow.fpo.policies import FPOPolicy
+from tests.helpers import collected, perturb
 
 
-def collected(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
-    """A model with a rollout in its buffer and what its first epoch draws."""
-    model = FPO(
-        "MlpPolicy",
-        "Pendulum-v1",
-        n_steps=64,
-        batch_size=16,
-        n_epochs=1,
-        seed=0,
-        policy_kwargs={"initialization": "glorot"},
-        **options,
-    )
-    model.learn(64)
-    model.policy.set_training_mode(False)
-    rollout = model.rollout_buffer.samples()
+def with_draws(**options: Any) -> tuple[FPO, FlowRolloutBufferSamples]:
+    """A model with a rollout and what its first epoch draws."""
+    model, rollout = collected(FPO, **options)
     return model, rollout._replace(drawn=FPOUpdate(model, rollout).draw(rollout))
 
 
@@ -36,16 +25,10 @@ def log_ratio(model: FPO, batch: FlowRolloutBufferSamples) -> th.Tensor:
     return FPOUpdate(model, batch).terms(batch, features).log_ratio
 
 
-def perturb(model: FPO, scale: float = 0.05) -> None:
-    with th.no_grad():
-        for parameter in model.policy.velocity.parameters():
-            parameter += scale * th.randn_like(parameter)
-
-
 @pytest.mark.parametrize("mc_average", ["loss", "objective"])
 @pytest.mark.parametrize("loss_target", ["epsilon", "velocity"])
 def test_ratio_is_one_at_equal_weights(mc_average: str, loss_target: str) -> None:
-    model, rollout = collected(mc_average=mc_average, loss_target=loss_target)
+    model, rollout = with_draws(mc_average=mc_average, loss_target=loss_target)
     for batch in model.rollout_buffer.minibatches(rollout, 16):
         ratio = log_ratio(model, batch).exp()
         assert ratio.shape == ((16,) if mc_average == "loss" else (16, 8))
@@ -54,8 +37,8 @@ def test_ratio_is_one_at_equal_weights(mc_average: str, loss_target: str) -> Non
 
 
 def test_ratio_does_not_depend_on_how_the_batch_is_split() -> None:
-    model, rollout = collected()
-    perturb(model)
+    model, rollout = with_draws()
+    perturb(model.policy.velocity, 0.05)
     whole = log_ratio(model, rollout)
     assert whole.abs().min() > 1e-5
     for size in (1, 7, 32):
@@ -68,7 +51,7 @@ def test_ratio_by_hand() -> None:
     """a = 3, eps = 1, t = 1/2: x_t = 2 and the target is 2; a velocity of 5 is wrong by 3."""
     losses = {"velocity": 9.0, "epsilon": 0.25 * 9.0}
     for target, expected in losses.items():
-        model, rollout = collected(loss_target=target, n_mc_samples=1)
+        model, rollout = with_draws(loss_target=target, n_mc_samples=1)
         with th.no_grad():
             model.policy.velocity.output.weight.zero_()
             model.policy.velocity.output.bias.fill_(5.0)
@@ -79,7 +62,7 @@ def test_ratio_by_hand() -> None:
 
 def test_epsilon_is_the_noise_that_the_velocity_stands_for() -> None:
     """FPO's time is 1 - t and its velocity u = -v: its eps-hat is x + (1 - tau) u = x - t v."""
-    model, rollout = collected(loss_target="epsilon", n_mc_samples=3)
+    model, rollout = with_draws(loss_target="epsilon", n_mc_samples=3)
     drawn: MonteCarloSamples = rollout.drawn
     times, noises = drawn.times.unsqueeze(-1), drawn.noises
     points = (1 - times) * noises + times * rollout.actions.unsqueeze(1)
@@ -92,16 +75,16 @@ def test_epsilon_is_the_noise_that_the_velocity_stands_for() -> None:
 
 
 def test_times_are_where_steps_start() -> None:
-    _, rollout = collected(n_flow_steps=4, n_mc_samples=50)
+    _, rollout = with_draws(n_flow_steps=4, n_mc_samples=50)
     assert sorted(set(rollout.drawn.times.flatten().tolist())) == [0.0, 0.25, 0.5, 0.75]
-    _, rollout = collected(n_flow_steps=4, n_mc_samples=50, time_sampler="uniform")
+    _, rollout = with_draws(n_flow_steps=4, n_mc_samples=50, time_sampler="uniform")
     assert len(set(rollout.drawn.times.flatten().tolist())) > 1000
 
 
 def test_losses_and_differences_are_clamped() -> None:
-    model, rollout = collected(loss_clamp=0.5, difference_clamp=0.25, mc_average="objective")
+    model, rollout = with_draws(loss_clamp=0.5, difference_clamp=0.25, mc_average="objective")
     assert rollout.drawn.reference_losses.max().item() == 0.5
-    perturb(model, 1.0)
+    perturb(model.policy.velocity, 1.0)
     assert log_ratio(model, rollout).abs().max().item() == 0.25
 
 
@@ -145,6 +128,6 @@ def test_noise_on_top_of_the_flow() -> None:
 
 
 def test_record_is_empty() -> None:
-    model, rollout = collected()
+    model, rollout = with_draws()
     assert rollout.record == ()
     assert model.rollout_buffer.actions.shape == (64, 1, 1)

@@ -150,6 +150,7 @@ caching.CacheImpl._locator_classes = []
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setup", ["sys.modules['numba'] = None", NO_FOLDER])
 def test_without_numba_everything_works_and_is_the_same(setup: str) -> None:
     """It is not there, or has no folder to keep in what it compiles."""
@@ -160,6 +161,7 @@ def test_without_numba_everything_works_and_is_the_same(setup: str) -> None:
     assert "numba cannot be used" in messages
 
 
+@pytest.mark.slow
 def test_kernels_are_kept_for_the_next_process_unless_outdated(tmp_path: Path) -> None:
     def compiled() -> dict[Path, int]:
         train_in_a_process(NUMBA_CACHE_DIR=str(tmp_path))

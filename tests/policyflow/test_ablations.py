@@ -10,9 +10,10 @@ from gymnasium import spaces
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.flows import PATHS, Rectified, StochasticInterpolant, VelocityField
+from sb3_policyflow.flows import INTERPOLANTS, Rectified, StochasticInterpolant, VelocityField
 from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from sb3_policyflow.policyflow.uniform import UniformTargets
+from tests.helpers import perturb
 
 GAUSSIAN: dict[str, Any] = {
     "gaussian": True,
@@ -42,10 +43,9 @@ def test_gaussian_mode_is_gaussian_ppo() -> None:
         old = gaussian()
         rollout = rollout._replace(actions=actions, record=record)
         update = PolicyFlowUpdate(model, rollout)
-        rollout = rollout._replace(drawn=update.draw(rollout))
-        for parameter in policy.parameters():
-            parameter += 0.05 * th.randn_like(parameter)
-        terms = update.terms(rollout, features)
+        drawn = update.draw(rollout)
+        perturb(policy, 0.05)
+        terms = update.terms(rollout._replace(drawn=drawn), features)
         new = gaussian()
     assert th.equal(record.latents, zeros)
     th.testing.assert_close(record.endpoints, old.mean)
@@ -82,19 +82,19 @@ def test_uniform_targets_make_actions_uniform(latent_std: float) -> None:
     assert points[:, 0].quantile(0.99).item() < 3.4
 
 
-@pytest.mark.parametrize("path", ["rectified", "trigflow"])
-def test_uniform_loss_vanishes_for_the_field_that_it_asks_for(path: str) -> None:
+@pytest.mark.parametrize("name", ["rectified", "trigflow"])
+def test_uniform_loss_vanishes_for_the_field_that_it_asks_for(name: str) -> None:
     """With a single action u the field dx/dt is a function of x and t, and meets the target."""
-    the_path = PATHS[path]()
+    interpolant = INTERPOLANTS[name]()
     box = spaces.Box(2.0, 2.0 + 1e-6, (1,))
 
     class Exact(VelocityField):
         def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
-            latent, endpoint, _ = (c.unsqueeze(-1) for c in the_path.coefficients(times))
+            latent, endpoint, _ = (c.unsqueeze(-1) for c in interpolant.coefficients(times))
             latents = (points - 2.0 * endpoint) / latent
-            return the_path.derivative(latents, th.full_like(points, 2.0), times)
+            return interpolant.derivative(latents, th.full_like(points, 2.0), times)
 
-    loss = UniformTargets(box, the_path).loss(Exact(1, 1), th.zeros(1000, 1))
+    loss = UniformTargets(box, interpolant).loss(Exact(1, 1), th.zeros(1000, 1))
     assert loss.item() < 1e-3
 
 

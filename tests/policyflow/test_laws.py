@@ -13,6 +13,7 @@ from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import clipped_surrogate
 from sb3_policyflow.policyflow.policies import PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import PathSamples, PolicyFlowUpdate
+from tests.helpers import perturb
 
 N_SAMPLES = 16
 
@@ -67,12 +68,6 @@ def sample_batch(
     return batch._replace(drawn=update.draw(batch)), features, update
 
 
-def perturb(model: PolicyFlow, scale: float = 0.05) -> None:
-    with th.no_grad():
-        for parameter in model.policy.parameters():
-            parameter += scale * th.randn_like(parameter)
-
-
 @pytest.mark.parametrize("interpolant", ["rectified", "stochastic", "trigflow"])
 @pytest.mark.parametrize("n_times", [1, 3])
 def test_nothing_has_changed_before_the_first_step(interpolant: str, n_times: int) -> None:
@@ -87,7 +82,7 @@ def test_nothing_has_changed_before_the_first_step(interpolant: str, n_times: in
 def test_ratio_is_that_of_the_shifted_gaussian() -> None:
     model = tiny_model()
     batch, features, update = sample_batch(model)
-    perturb(model)
+    perturb(model.policy, 0.05)
     terms = update.terms(batch, features)
     drawn: PathSamples = batch.drawn
     with th.no_grad():
@@ -129,7 +124,7 @@ def test_equals_gaussian_ppo_when_the_reference_velocity_and_the_latents_are_zer
     zeros = th.zeros_like(batch.actions)
     batch = batch._replace(record=PolicyFlowRecord(zeros, zeros), actions=th.randn_like(zeros))
     batch = batch._replace(drawn=update.draw(batch))
-    perturb(model)
+    perturb(model.policy, 0.05)
     advantages, parameters = batch.advantages, actor_parameters(model)
 
     terms = update.terms(batch, features)
@@ -157,7 +152,7 @@ def actor_parameters(model: PolicyFlow) -> list[nn.Parameter]:
 def test_gradient_equals_finite_differences_for_every_parameter(interpolant: str) -> None:
     model = tiny_model(interpolant=interpolant, brownian_coef=0.25, ent_coef=0.01, n_times=2)
     batch, features, update = sample_batch(model)
-    perturb(model, 0.02)
+    perturb(model.policy, 0.02)
 
     def loss() -> th.Tensor:
         terms = update.terms(batch, features)
@@ -226,7 +221,7 @@ def test_approximate_ratio_approaches_the_exact_one_for_small_updates() -> None:
         model = tiny_model(n_times=64, time_average="shift")
         batch, features, _ = sample_batch(model)
         th.manual_seed(5)
-        perturb(model, scale)
+        perturb(model.policy, scale)
         with th.no_grad():
             drawn: PathSamples = batch.drawn
             new = model.policy.velocity(drawn.points, drawn.times, features.unsqueeze(1))

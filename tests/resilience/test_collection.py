@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_policyflow import PolicyFlow
@@ -75,17 +76,11 @@ def test_time_limits_are_bootstrapped_and_terminations_are_not(scheme: str, as_d
 
 def test_same_rewards_as_sb3s_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = collected(clocks())
-    monkeypatch.setattr(PolicyFlow, "_update_info_buffer", sb3s_update)
+    # SB3's own loop finds the time limits and bootstraps one by one.
+    monkeypatch.setattr(PolicyFlow, "collect_rollouts", OnPolicyAlgorithm.collect_rollouts)
     theirs = collected(clocks())
     np.testing.assert_allclose(ours.rollout_buffer.rewards, theirs.rollout_buffer.rewards, 1e-6)
     assert ours.rollout_buffer.rewards.std() > 0
-
-
-def sb3s_update(self: PolicyFlow, infos: Any, dones: Any = None) -> None:
-    """SB3's own method, so that its loop finds the time limits and bootstraps one by one."""
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
-    BaseAlgorithm._update_info_buffer(self, infos, dones)
 
 
 def test_worker_processes_and_normalized_rewards() -> None:

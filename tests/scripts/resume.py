@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 from sb3_policyflow.resilience.saving import RandomStates
+from tests.helpers import last_observations, n_updates
 
 ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -41,7 +43,8 @@ def digest(model: Any) -> str:
         *model.policy.state_dict().values(),
         *(value for state in optimizer["state"].values() for value in state.values()),
         *(normalize.obs_rms.mean, normalize.obs_rms.var, normalize.ret_rms.var, normalize.returns),
-        *(model._last_obs, model._n_updates, model.num_timesteps, model.adaptive_learning_rate),
+        *(last_observations(model), n_updates(model)),
+        *(model.num_timesteps, model.adaptive_learning_rate),
         RandomStates.now(model.device).torch,
     ]
     sha = hashlib.sha256()
@@ -50,15 +53,21 @@ def digest(model: Any) -> str:
     return sha.hexdigest()
 
 
-class EnvStateCheckpoint(RolloutCheckpointCallback):
-    """Keeps the state of the environment beside the model, which MultiGoal alone can tell."""
+class KeepEnvState(BaseCallback):
+    """Writes the state of the environment half-way, which MultiGoal alone can tell."""
 
-    def _save(self) -> None:
-        super()._save()
-        environment: Any = self.training_env  # wrappers find it in MultiGoalVecEnv
-        state = pickle.dumps(environment.get_state())
-        path = Path(self.save_path) / f"env_{self.num_timesteps}.pkl"
-        path.write_bytes(state)
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps == HALF:
+            environment: Any = self.training_env  # wrappers find it in MultiGoalVecEnv
+            state = pickle.dumps(environment.get_state())
+            (self.folder / f"env_{HALF}.pkl").write_bytes(state)
 
 
 def whole(folder: Path, algorithm: type[Any]) -> Any:
@@ -76,10 +85,10 @@ def whole(folder: Path, algorithm: type[Any]) -> Any:
         policy_kwargs={"net_arch": [16, 16], "embedding_dim": 8},
         **OPTIONS[algorithm.__name__],
     )
-    checkpoint = EnvStateCheckpoint(
+    checkpoint = RolloutCheckpointCallback(
         HALF // N_ENVS, str(folder), name_prefix="model", save_vecnormalize=True
     )
-    return model.learn(TOTAL, checkpoint)
+    return model.learn(TOTAL, [checkpoint, KeepEnvState(folder)])
 
 
 def resume(folder: Path, algorithm: type[Any]) -> Any:

@@ -46,7 +46,7 @@ class Watch(BaseCallback):
         self.seconds = 60 * minutes
         self.samples: list[Sample] = []
         self.start = time.perf_counter()
-        self._due = 0
+        self.due = 0
 
     def _on_step(self) -> bool:
         return time.perf_counter() - self.start < self.seconds
@@ -61,8 +61,8 @@ class Watch(BaseCallback):
                 len(os.listdir("/proc/self/fd")),
             )
         )
-        if self.num_timesteps >= self._due:
-            self._due += TOTAL_TIMESTEPS // 20
+        if self.num_timesteps >= self.due:
+            self.due += TOTAL_TIMESTEPS // 20
             say(self.samples[-1])
 
 

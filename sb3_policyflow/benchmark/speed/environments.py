@@ -24,7 +24,7 @@ from sb3_policyflow.benchmark.errors import require_env
 from sb3_policyflow.benchmark.measure.provenance import machine
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS
-from sb3_policyflow.integrations.rl_zoo3.vec_env import has_own_vectorization, make_native_vec_env
+from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
 
 DEFAULT_IDS = tuple(f"{PLAYGROUND}{task}-v0" for task in PLAYGROUND_TASKS)
 DEFAULT_SIZES = (64, 256, 1024)

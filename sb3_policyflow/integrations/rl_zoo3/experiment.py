@@ -10,7 +10,7 @@ import optuna
 import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_policyflow.integrations.rl_zoo3.vec_env import has_own_vectorization, make_native_vec_env
+from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
 
 PACKAGE = Path(__file__).parents[2]
 

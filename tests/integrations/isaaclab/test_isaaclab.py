@@ -51,7 +51,7 @@ def test_trains_and_goes_on(version: str, tmp_path: Path) -> None:
     assert {"model.zip", "model_256_steps.zip", "model_512_steps.zip", "PolicyFlow_1"} <= names
     model = PolicyFlow.load(folder / "model.zip")
     assert (model.seed, model.n_envs, model.num_timesteps) == (7, 16, 512)
-    assert (model.batch_size, model.clip_range_vf(1.0), model.n_flow_steps) == (32, 0.2, 2)
+    assert (model.batch_size, model.clip_range_vf(1.0), model.policy.n_flow_steps) == (32, 0.2, 2)
     assert model.policy.activation_fn is th.nn.ELU
     run_script(version, tmp_path, *common, "--checkpoint", f"{folder}/model", "--log_dir", "on")
     model = PolicyFlow.load(tmp_path / "on" / "model.zip")

@@ -15,9 +15,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMoni
 import sb3_policyflow  # noqa: F401  # registers
 from sb3_policyflow.envs import PLAYGROUND_TASKS
 from sb3_policyflow.envs.multigoal import MultiGoalVectorEnv
+from sb3_policyflow.envs.native import make_native_vec_env
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 from sb3_policyflow.integrations.rl_zoo3.experiment import choose_config, hyperparams_folder
-from sb3_policyflow.integrations.rl_zoo3.vec_env import make_native_vec_env
 
 if importlib.util.find_spec("rl_zoo3") is None:
     pytest.skip("rl_zoo3 is not installed", allow_module_level=True)

@@ -177,7 +177,7 @@ def test_editable_install_and_a_checkout_that_moved(tmp_path: Path) -> None:
         shutil.copy(REPOSITORY / name, checkout / name)
     wheel = build("editable", tmp_path, checkout)
     environment = Environment.create(tmp_path / "environment").install(wheel)
-    where = "import rl_zoo3.utils as u; print(u.ALGOS['policyflow'].__init__.__code__.co_filename)"
+    where = "import inspect, rl_zoo3.utils as u; print(inspect.getfile(u.ALGOS['policyflow']))"
     output = environment.run("-c", where, folder=tmp_path)
     assert output.endswith(f"{checkout}/sb3_policyflow/policyflow/policyflow.py\n")
     module = "sb3_policyflow.integrations.rl_zoo3.experiment"
