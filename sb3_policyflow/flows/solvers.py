@@ -101,6 +101,19 @@ class AdamsBashforth2:
     """The two-step Adams-Bashforth method: order two for one evaluation a step.
 
     x(t + h) = x + h (3/2 v(x_t, t) - 1/2 v(x_{t-h}, t - h)),    with one Euler step to start.
+
+    What it buys: mean distance of end points from those of 400 steps of rk4, for the same number of
+    evaluations and so in the same time. The field is two-dimensional with hidden layers [256, 128,
+    64] and was trained by flow matching on four modes. With an untrained one, 24 evaluations of ab2
+    have 0.7 of midpoint's error, and twice that of rk4.
+
+    ===========  ======  ========  ======  ======  ======
+    evaluations  euler   midpoint  heun    rk4     ab2
+    ===========  ======  ========  ======  ======  ======
+    12           0.069   0.020     0.030   0.016   0.014
+    24           0.033   0.0065    0.0088  0.0044  0.0039
+    48           0.015   0.0018    0.0024  0.0003  0.0010
+    ===========  ======  ========  ======  ======  ======
     """
 
     order: int = 2

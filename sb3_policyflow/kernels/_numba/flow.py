@@ -31,10 +31,11 @@ def flow(
     :param stop: The row behind the last.
     """
     width, dim, n_values = network.widths[0], latents.shape[1], total(network.widths)
-    values = np.empty(ROWS * n_values, F)
-    shifts = np.empty((ROWS, width), F)
-    stages = np.empty((method.time_indices.shape[1], ROWS, dim), F)
-    scratch = np.empty((2, ROWS, dim), F)
+    most = min(ROWS, stop - start)
+    values = np.empty(most * n_values, F)
+    shifts = np.empty((most, width), F)
+    stages = np.empty((method.time_indices.shape[1], most, dim), F)
+    scratch = np.empty((2, most, dim), F)
     for begin in range(start, stop, ROWS):
         end = min(begin + ROWS, stop)
         rows = end - begin

@@ -115,7 +115,7 @@ def forward(
     hidden = _arrange(network)
     weight = matrix(network.weights[-1], n_outputs, widths[-1])
     bias = vector(network.biases[-1], n_outputs)
-    workspace = np.empty(ROWS * n_saved, F)
+    workspace = np.empty(min(ROWS, stop - start) * n_saved, F)
     group = points.shape[0] // max(shifts.shape[0], 1)
     for begin in range(start, stop, ROWS):
         end = min(begin + ROWS, stop)
@@ -164,7 +164,7 @@ def backward(
     widest = 0
     for layer_width in widths:
         widest = max(widest, layer_width)
-    scratch = np.empty((2, ROWS * widest), F)
+    scratch = np.empty((2, min(ROWS, stop - start) * widest), F)
     table_start, table_end = n_points * width, (n_points + n_entries) * width
     grad_first = gradients.parameters[:table_start].reshape((n_points, width))
     grad_table = gradients.parameters[table_start:table_end].reshape((n_entries, width))

@@ -6,8 +6,13 @@ import numpy as np
 from numba import njit
 
 F = np.float32
-ROWS = 16
-"""Rows that are carried through a network together."""
+ROWS = 64
+"""Rows that are carried through a network together, see :mod:`~.tiles`.
+
+Their activations must stay in a core's second-level cache. In place of 16, 64 takes 0.94 to 0.97 of
+the time of a flow or of gradients with hidden layers [256, 128, 64], and 0.89 to 0.96 with [64, 64]
+(Intel Xeon, family 6, model 167, one thread, 1024 and 6144 rows). No result depends on it.
+"""
 
 # Divisions by zero give infinity, as in torch, and threads may run beside each other.
 _COMMON: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}

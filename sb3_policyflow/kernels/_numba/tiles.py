@@ -2,6 +2,21 @@
 
 Loops in Python become vector instructions, but their sums go to memory and back at every step,
 which makes them two to three times slower.
+
+``np.dot`` in their place, the BLAS that numba takes from SciPy, needs this many times the tiles'
+time (medians of 25, in turn; Intel Xeon, family 6, model 167, with AVX-512, one thread):
+
+==========================================  ===================  ===================
+hidden layers: what                         blocks of 16 rows    blocks of 64 rows
+==========================================  ===================  ===================
+[256, 128, 64], Mish: flow of 1024 rows     1.07                 1.28
+[256, 128, 64], Mish: gradients, 6144 rows  1.46                 1.43
+[64, 64], Tanh: flow of 1024 rows           1.11                 1.05
+[64, 64], Tanh: gradients of 6144 rows      1.16                 1.05
+==========================================  ===================  ===================
+
+Single layers of 64 rows need from 0.77 (6 to 64 units) to 1.37 (256 to 128) of it. With a BLAS an
+action would also depend on who else acts, in its last bits, and numba would need SciPy.
 """
 
 from typing import Any
