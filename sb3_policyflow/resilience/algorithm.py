@@ -16,9 +16,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow.resilience.collection import (
     Infos,
-    RolloutVecEnv,
+    PendingBonus,
+    StepChecks,
     rollback_statistics,
     terminal_observations,
+    time_limits,
 )
 from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
 from sb3_policyflow.resilience.finite import check_rollout
@@ -31,8 +33,9 @@ SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """SB3's ``OnPolicyAlgorithm`` with guarded rollouts, whole files and exact resume.
 
-    - Rollouts are collected through a :class:`RolloutVecEnv`: numbers that are not finite, wrong
-      shapes and dead worker processes stop the training with a sentence, before parameters change.
+    - Rollouts are collected by SB3's loop, in the user's own environment, and checked step by step:
+      numbers that are not finite, wrong shapes and dead worker processes stop the training with a
+      sentence, before parameters change.
     - ``save`` writes a file completely or not at all, with the states of the random generators
       besides what SB3 saves: parameters, optimizer, counters, progress and last observations.
     - After ``load``, the next ``learn`` continues as if the run had not been interrupted.
@@ -44,7 +47,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """The value with which an episode cut by a time limit continues: that of the "terminal"
     observation, as in SB3, of the "current" one before it, or "none"."""
 
-    _collector: RolloutVecEnv | None = None
+    _callback: BaseCallback | None = None
+    """The callback of the rollout that is being collected; its ``locals`` are the loop's."""
+    _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
 
@@ -54,6 +59,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     def _guarded(self) -> Iterator[VecEnv]:
         """A block that uses the environment; names its faults and undoes what can be undone."""
         assert self.env is not None
+        self._step_checks = StepChecks(self.env)
         watched = watch_workers(self.env, lambda: self.num_timesteps)
         with watched, rollback_statistics(self.get_vec_normalize_env()):
             yield self.env
@@ -66,9 +72,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             raise ValueError(
                 "The model has no environment to learn in: give one to load, as env, or to set_env."
             )
-        with self._guarded() as env:
+        with self._guarded():
             prepared = super()._setup_learn(*args, **kwargs)
-            RolloutVecEnv(env, self.num_timesteps).check_observations(self._last_obs)
+            self._step_checks.check_observations(self._last_obs, self.num_timesteps)
         return prepared
 
     def collect_rollouts(
@@ -86,23 +92,26 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         first_timestep = self.num_timesteps
         try:
             with self._guarded():
-                self._collector = RolloutVecEnv(env, first_timestep)
-                complete = super().collect_rollouts(
-                    self._collector, callback, rollout_buffer, n_rollout_steps
-                )
+                self._callback = callback
+                complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:
-            self._collector = None
+            self._callback = None
         if complete:
             check_rollout(rollout_buffer, first_timestep)
         return complete
 
     def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
         # SB3's loop calls this after the callbacks and before it bootstraps.
-        super()._update_info_buffer(infos, dones)
-        if self._collector is not None and dones is not None:
-            self._collector.bootstrap_timeouts(
-                infos, dones, lambda indices: self._timeout_values(infos, indices), self.gamma
-            )
+        super()._update_info_buffer(infos, dones)  # type: ignore[arg-type]  # any sequence will do
+        if self._callback is None or dones is None:
+            return
+        step = self._callback.locals
+        self._step_checks.check_rewards(step["rewards"], self.num_timesteps)
+        self._step_checks.check_observations(step["new_obs"], self.num_timesteps)
+        indices = time_limits(infos, dones)
+        if indices and hasattr(self.rollout_buffer, "pending_bonus"):
+            values = self._timeout_values(infos, indices).flatten().cpu().numpy()
+            self.rollout_buffer.pending_bonus = PendingBonus(infos, indices, self.gamma * values)
 
     def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
         """Values of the states with which episodes continue beyond their time limits."""
@@ -110,9 +119,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             return th.zeros(len(indices))
         observations: Any = self._last_obs
         if self.timeout_bootstrap == "terminal":
-            observations = terminal_observations(infos, indices)
-            assert self._collector is not None
-            self._collector.check_observations(observations, "terminal observation", indices)
+            observations = terminal_observations(infos, indices, self.observation_space)
+            kind = "terminal observation"
+            self._step_checks.check_observations(observations, self.num_timesteps, kind, indices)
         elif isinstance(observations, dict):
             observations = {key: values[indices] for key, values in observations.items()}
         else:
@@ -153,7 +162,12 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             del self.resume_state
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_collector", "_saved_random_states"]
+        return [
+            *super()._excluded_save_params(),
+            "_callback",
+            "_step_checks",
+            "_saved_random_states",
+        ]
 
     @classmethod
     def load(
