@@ -174,7 +174,8 @@ class _Embedding:
         """
         table, entries, shifts = self._first[:3]
         if times_shape != leading:
-            entries = np.broadcast_to(entries.reshape(times_shape), leading).reshape(-1)
+            # A copy: numba would compile the kernels again for a view that is not contiguous.
+            entries = np.broadcast_to(entries.reshape(times_shape), leading).flatten()
         stride = self._parts.network.n_inputs
         return KernelInput(points, stride, table[: len(self._times)], entries, shifts)
 

@@ -9,7 +9,7 @@ import torch as th
 from sb3_policyflow.flows import SOLVERS, Solver, VelocityField
 from sb3_policyflow.flows.folding import fold
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
-from sb3_policyflow.kernels.layouts import Array, FoldedNetwork, Kernels, Method
+from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Integers, Kernels, Method
 from sb3_policyflow.kernels.mlp import MLP
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
@@ -126,7 +126,7 @@ def _make_plan(
     return FlowPlan(network.kernels, folded, method, time_indices.size * network.flops_per_row)
 
 
-def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Array, Array]:
+def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Integers, Floats]:
     """``time_indices`` and ``tableau`` of a :class:`Method`."""
     memory = 0.0
     if isinstance(solver, AdamsBashforth2):

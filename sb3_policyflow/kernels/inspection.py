@@ -142,14 +142,12 @@ class KernelView(Generic[P]):
         if not is_eager():
             return "it is being compiled, exported or traced"
         kernels = load_kernels()
-        reason = kernels if isinstance(kernels, str) else self._update(kernels, module)
-        if reason is None and self._parts is not None:
-            return self._parts
-        note_fallback(str(reason))
-        return str(reason)
+        found = kernels if isinstance(kernels, str) else self._current_parts(kernels, module)
+        if isinstance(found, str):
+            note_fallback(found)
+        return found
 
-    def _update(self, kernels: Kernels, module: Any) -> str | None:
-        """Read the module if it has changed, and return the reason if it cannot be used."""
+    def _current_parts(self, kernels: Kernels, module: Any) -> P | str:
         parts = self._parts
         if parts is None or module is not self._module or not self._inspector.is_current():
             self._module, self._inspector, self._parts = module, ModuleInspector(), None
@@ -160,7 +158,7 @@ class KernelView(Generic[P]):
         # Setting parameter.data can change all of a tensor and leave it the same object.
         if not (has_same_shapes(parts.tensors, parts.shapes) and are_usable(parts.tensors)):
             return why_unusable(parts.tensors)
-        return None
+        return parts
 
 
 def is_eager() -> bool:

@@ -210,6 +210,21 @@ def test_derivatives_of_derivatives_of_a_critic() -> None:
         close(ours, theirs, ulps=400)
 
 
+def test_derivatives_of_derivatives_are_those_of_the_weights_then() -> None:
+    """Even if the parameters have been replaced before the backward pass."""
+    field = make_field(2, 3, [8])
+    plain = plain_copy(field)
+    x, t, s = th.randn(4, 2), th.rand(4), th.randn(4, 3)
+    second = []
+    for net in (field, plain):
+        points = x.clone().requires_grad_()
+        velocity = net(points, t, s)
+        net.hidden[0] = nn.Linear(66, 8)
+        (slope,) = th.autograd.grad(velocity.square().sum(), points, create_graph=True)
+        second.append(th.autograd.grad(slope.square().sum(), points)[0])
+    close(*second, ulps=400)
+
+
 def test_weights_changed_between_the_two_ways_are_noticed() -> None:
     field = make_field(2, 3, [8])
     velocity = field(th.randn(4, 2), th.rand(4), th.randn(4, 3))
