@@ -121,7 +121,8 @@ def bounds(name: str, value: object) -> None:
 def positive_bounds(name: str, value: object) -> None:
     """A lowest and a highest positive number."""
     bounds(name, value)
-    if not value[0] > 0:  # type: ignore[index]  # two numbers by now
+    ends: Any = value
+    if not ends[0] > 0:
         raise ValueError(f"{name} must be positive, got {value!r}.")
 
 

@@ -119,7 +119,7 @@ def shares_options(
                 raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
             cast("Callable[..., None]", init)(**{**defaults, **given})
 
-        completed.__signature__ = signature  # type: ignore[attr-defined]  # inspect looks here
+        vars(completed)["__signature__"] = signature  # where inspect looks for it
         return cast("Callable[P, None]", completed)
 
     return complete

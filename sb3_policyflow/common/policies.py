@@ -1,5 +1,6 @@
 """What the policies of all flow algorithms share: networks, values, and how an action is made."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -22,7 +23,8 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names, own_options
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
-from sb3_policyflow.kernels import KernelCritic, make_velocity_field
+from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
+from sb3_policyflow.resilience.finite import NotFiniteError
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -251,14 +253,26 @@ class FlowPolicy(ActorCriticPolicy):
         """
         actor_features, critic_features = self.actor_critic_features(obs)
         actions, record = self.sample_actions(actor_features, deterministic)
-        return self._shaped(actions), self.values(critic_features), record
+        return self._finished(actions), self.values(critic_features), record
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actions, _ = self.sample_actions(self.actor_features(observation), deterministic)
-        return self._shaped(actions)
+        return self._finished(actions)
 
-    def _shaped(self, actions: th.Tensor) -> th.Tensor:
+    def _finished(self, actions: th.Tensor) -> th.Tensor:
+        """Actions in the shape of their space, (n, ...).
+
+        :raises NotFiniteError: If one is not finite, as SB3's PPO does before anything acts on it.
+        """
         assert self.action_space.shape is not None
+        # The sum of finite numbers is finite but for overflow, and takes half the time.
+        if has_values() and not math.isfinite(actions.sum()) and not actions.isfinite().all():
+            row = int((~actions.isfinite()).any(dim=-1).nonzero()[0])
+            raise NotFiniteError(
+                f"The policy's action is not finite, for observation {row} of the batch: look for "
+                "numbers that are not finite in the observation and in the parameters. In "
+                "training, load an earlier checkpoint and lower the learning rate."
+            )
         return actions.reshape(-1, *self.action_space.shape)
 
     def keep_within_bounds(self) -> None:

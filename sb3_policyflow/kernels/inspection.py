@@ -166,6 +166,11 @@ def is_eager() -> bool:
     return not th.compiler.is_compiling() and th._C._get_tracing_state() is None
 
 
+def has_values() -> bool:
+    """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
+    return is_eager() and th._C._functorch.peek_interpreter_stack() is None
+
+
 def has_same_shapes(tensors: Iterable[th.Tensor], shapes: list[th.Size]) -> bool:
     """Whether tensors have the shapes that they were read in."""
     return [tensor.shape for tensor in tensors] == shapes

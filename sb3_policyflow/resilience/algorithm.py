@@ -100,9 +100,11 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             check_rollout(rollout_buffer, first_timestep)
         return complete
 
-    def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
         # SB3's loop calls this after the callbacks and before it bootstraps.
-        super()._update_info_buffer(infos, dones)  # type: ignore[arg-type]  # any sequence will do
+        super()._update_info_buffer(infos, dones)
         if self._callback is None or dones is None:
             return
         step = self._callback.locals
