@@ -46,6 +46,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         over the whole "rollout".
     :param timeout_bootstrap: The value with which an episode cut by a time limit continues: that of
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
+    :param allow_nan_observations: Whether the features extractor can handle observations that are
+        not finite, such as NaN for a missing reading. By default they stop the training.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -98,6 +100,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         lr_adaptation_kwargs: dict[str, Any] | None = None,
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
+        allow_nan_observations: bool = False,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -110,6 +113,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.lr_adaptation_kwargs = lr_adaptation_kwargs
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
+        self.allow_nan_observations = allow_nan_observations
         self.policy_options = policy_options
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None

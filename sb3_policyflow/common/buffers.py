@@ -8,11 +8,11 @@ import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.tree import rows, tensors
+from sb3_policyflow.common.tree import are_small, rows, tensors
 from sb3_policyflow.resilience.collection import PendingBonus
 
 SHUFFLED_AT_ONCE = 2**26
-"""Bytes of a rollout up to which a shuffled copy of it is made for each epoch."""
+"""Bytes of a rollout up to which a shuffled copy of it is made for each epoch, if its rows are small."""
 
 
 class FlowRolloutBufferSamples(NamedTuple):
@@ -133,8 +133,9 @@ class RecordBufferMixin(RolloutBuffer):
         )
         size = batch_size or n_samples
         parts = [slice(start, start + size) for start in range(0, n_samples, size)]
-        if sum(tensor.nbytes for tensor in tensors(samples)) <= SHUFFLED_AT_ONCE:
-            # Many views of one shuffled copy are faster than many gathers of few rows.
+        n_bytes = sum(tensor.nbytes for tensor in tensors(samples))
+        if n_bytes <= SHUFFLED_AT_ONCE and are_small(samples):
+            # Many views of one shuffled copy are faster than many gathers of few small rows.
             shuffled = rows(samples, indices)
             yield from (rows(shuffled, part) for part in parts)
         else:

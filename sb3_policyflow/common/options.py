@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.foreign import unknown_argument
 from sb3_policyflow.common.schedules import Coefficient, check_lr_adaptation, parse_schedule
 
 P = ParamSpec("P")
@@ -55,6 +56,7 @@ class FlowOptions(TypedDict, total=False):
     lr_adaptation_kwargs: dict[str, Any] | None
     advantage_scope: str
     timeout_bootstrap: str
+    allow_nan_observations: bool
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
@@ -112,6 +114,7 @@ def shares_options(
         @functools.wraps(init)
         def completed(*args: Any, **options: Any) -> None:
             options = with_present_names(options, former_names)
+            _check_names(signature, policy_class, args, options)
             given = signature.bind(*args, **options).arguments
             twice = sorted(names & given.keys() & (given.get("policy_kwargs") or {}).keys())
             if twice:
@@ -146,26 +149,66 @@ def _named(signature: inspect.Signature) -> dict[str, inspect.Parameter]:
     return {name: p for name, p in signature.parameters.items() if p.kind not in collecting}
 
 
+def _check_names(
+    signature: inspect.Signature,
+    policy_class: type[Any],
+    args: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> None:
+    """Refuse arguments that an algorithm does not have, and one that would have no effect.
+
+    :raises TypeError: With where an argument belongs, or which one may be meant.
+    :raises ValueError: If options of gSDE are given.
+    """
+    model, policy, *_ = (*args, options.get("policy"))
+    if isinstance(policy, type) and issubclass(policy, policy_class):
+        policy_class = policy
+    own = signature.parameters.keys() - {"self"}
+    for name in options.keys() - own:
+        of_policy = _policy_parameters(policy_class).keys() - own
+        raise unknown_argument(type(model).__name__, name, own, of_policy)
+    if options.get("sde_sample_freq", -1) != -1:
+        raise ValueError(
+            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
+            "not support: leave it out."
+        )
+
+
 def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
     """The keyword-only parameters of a policy's constructors, its own options."""
-    options: dict[str, inspect.Parameter] = {}
+    parameters = _policy_parameters(policy_class).values()
+    return [parameter for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+
+
+def _policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
+    """What the constructors of a policy and of its bases take from ``policy_kwargs``."""
+    found: dict[str, inspect.Parameter] = {}
     for cls in policy_class.__mro__:
         if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
-            parameters = inspect.signature(vars(cls)["__init__"]).parameters
-            options |= {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
-    return list(options.values())
+            found |= _named(inspect.signature(vars(cls)["__init__"]))
+    for name in ("self", "observation_space", "action_space", "lr_schedule"):
+        found.pop(name, None)
+    return found
 
 
 def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Let a constructor take options under their former names too, with a warning.
+    """Let a policy take options under their former names too, with a warning.
+
+    Where it does not hand others on, those that it does not have are refused with a sentence.
 
     :param former_names: Present names by former ones.
     """
 
     def extend(init: Callable[P, None]) -> Callable[P, None]:
+        parameters = inspect.signature(init).parameters
+        hands_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+
         @functools.wraps(init)
         def extended(*args: P.args, **options: P.kwargs) -> None:
             present = with_present_names(options, former_names)
+            for name in present.keys() - parameters.keys() if not hands_on else ():
+                owner = type(args[0])
+                raise unknown_argument(owner.__name__, name, _policy_parameters(owner))
             cast("Callable[..., None]", init)(*args, **present)
 
         return extended
@@ -224,6 +267,12 @@ def check_algorithm(model: Any) -> None:
     checks.check_environment(name, model.env, space)
     checks.check_flow_spaces(model.action_space, model.use_sde)
     checks.check_policy_class(name, model.policy_class, model.policy_base)
+    for option in (model.policy_kwargs or {}).keys() - _policy_parameters(model.policy_class):
+        if option in inspect.signature(type(model)).parameters:
+            raise TypeError(
+                f"{option} is an option of the algorithm and not of its policy: take it out of "
+                f"policy_kwargs, as {name}(..., {option}=...)."
+            )
     checks.check_options(model)
     checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
     if model.desired_kl is None:

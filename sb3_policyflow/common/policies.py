@@ -20,9 +20,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.foreign import check_overridden_methods
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names, own_options
-from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
+from sb3_policyflow.flows import INITIALIZATIONS, FourierTimeEmbedding, VelocityField
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
 
@@ -101,6 +102,7 @@ class FlowPolicy(ActorCriticPolicy):
         random_latents: bool = False,
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
+        check_overridden_methods(type(self), FlowPolicy)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
@@ -144,7 +146,11 @@ class FlowPolicy(ActorCriticPolicy):
         return list(arch.get(head, [])) if isinstance(arch, dict) else list(arch)
 
     def _build_mlp_extractor(self) -> None:
-        """Build the critic's hidden layers; the actor's belong to the velocity field."""
+        """Build the critic's hidden layers; the actor's belong to the velocity field.
+
+        Networks of one's own, built here as SB3 documents, have their part: the velocity is
+        conditioned on what ``forward_actor`` makes of the features.
+        """
         self.mlp_extractor = MlpExtractor(
             self.features_dim,
             net_arch={"pi": [], "vf": self._layers("vf")},
@@ -155,11 +161,14 @@ class FlowPolicy(ActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         # SB3 has made those of a Gaussian actor, and the optimizer of its parameters.
-        del self.action_net, self.log_std
+        del self.action_net, self.action_dist, self.log_std
         self._build_actor()
         self._kernel_critic = KernelCritic()
+        embeddings = [part for part in self.modules() if isinstance(part, FourierTimeEmbedding)]
+        fixed = {id(embedding.frequencies) for embedding in embeddings}
+        learned = [parameter for parameter in self.parameters() if id(parameter) not in fixed]
         self.optimizer = make_optimizer(
-            self.optimizer_class, self.parameters(), lr_schedule(1), self.optimizer_kwargs
+            self.optimizer_class, learned, lr_schedule(1), self.optimizer_kwargs
         )
 
     @abstractmethod
@@ -169,7 +178,7 @@ class FlowPolicy(ActorCriticPolicy):
     def _make_velocity_field(self) -> VelocityField:
         return make_velocity_field(
             self.action_dim,
-            self.features_dim,
+            self.mlp_extractor.latent_dim_pi,
             net_arch=self._layers("pi"),
             activation_fn=self.activation_fn,
             embedding_dim=self.embedding_dim,
@@ -179,8 +188,17 @@ class FlowPolicy(ActorCriticPolicy):
         )
 
     def critic_parameters(self) -> Iterator[nn.Parameter]:
-        """The parameters that serve the critic alone."""
-        yield from self.mlp_extractor.value_net.parameters()
+        """The parameters that serve the critic alone.
+
+        :raises TypeError: If an ``mlp_extractor`` of one's own does not tell.
+        """
+        extractor = self.mlp_extractor
+        if not isinstance(getattr(extractor, "value_net", None), nn.Module):
+            raise TypeError(
+                f"To train the critic alone, its part of {type(extractor).__name__} must be a "
+                "module named value_net, as in SB3's MlpExtractor."
+            )
+        yield from extractor.value_net.parameters()
         yield from self.value_net.parameters()
         if not self.share_features_extractor:
             yield from self.vf_features_extractor.parameters()
@@ -188,12 +206,14 @@ class FlowPolicy(ActorCriticPolicy):
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim)."""
         # BasePolicy's extract_features serves one extractor, ActorCriticPolicy's always both.
-        return super(ActorCriticPolicy, self).extract_features(obs, self.pi_features_extractor)
+        features = super(ActorCriticPolicy, self).extract_features(obs, self.pi_features_extractor)
+        return self.mlp_extractor.forward_actor(features)
 
     def actor_critic_features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Features for actor and critic, extracted once where they are shared."""
         features = self.extract_features(obs)
-        return features if isinstance(features, tuple) else (features, features)
+        actor, critic = features if isinstance(features, tuple) else (features, features)
+        return self.mlp_extractor.forward_actor(actor), critic
 
     def set_training_mode(self, mode: bool) -> None:
         """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
@@ -289,6 +309,10 @@ class FlowPolicy(ActorCriticPolicy):
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Refuse: the likelihood of an action under a flow policy has no closed form."""
         raise self._no_likelihood()
+
+    def reset_noise(self, n_envs: int = 1) -> None:  # noqa: ARG002
+        """Refuse: this is gSDE's noise."""
+        raise TypeError(f"{type(self).__name__} does not support gSDE, whose noise this resets.")
 
     def _no_likelihood(self) -> TypeError:
         return TypeError(

@@ -119,6 +119,8 @@ class DPPOPolicy(FlowPolicy):
             self.base_velocity = deepcopy(self.velocity).requires_grad_(False)
             self.base_features_extractor = deepcopy(self.pi_features_extractor)
             self.base_features_extractor.requires_grad_(False)
+            if self._has_own_networks:
+                self.base_mlp_extractor = deepcopy(self.mlp_extractor).requires_grad_(False)
 
     @property
     def n_evaluations_per_action(self) -> int:
@@ -127,12 +129,15 @@ class DPPOPolicy(FlowPolicy):
     def freeze_base(self) -> None:
         """Let the steps that are not trained use the networks as they are now, say after imitation.
 
-        These are the velocity field and the actor's features extractor.
+        These are the velocity field, the actor's features extractor, and networks between them of
+        one's own.
         """
         if self.n_frozen_steps > 0:
             self.base_velocity.load_state_dict(self.velocity.state_dict())
             extractor = self.pi_features_extractor.state_dict()
             self.base_features_extractor.load_state_dict(extractor)
+            if self._has_own_networks:
+                self.base_mlp_extractor.load_state_dict(self.mlp_extractor.state_dict())
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim).
@@ -150,13 +155,20 @@ class DPPOPolicy(FlowPolicy):
     @property
     def _has_base_features(self) -> bool:
         learns = any(True for _ in self.pi_features_extractor.parameters())
-        return self.n_frozen_steps > 0 and learns
+        return self.n_frozen_steps > 0 and (learns or self._has_own_networks)
+
+    @property
+    def _has_own_networks(self) -> bool:
+        """Whether a policy of the user's own puts networks between extractor and velocity."""
+        return type(self)._build_mlp_extractor is not FlowPolicy._build_mlp_extractor
 
     def _with_base(self, features: th.Tensor, obs: PyTorchObs) -> th.Tensor:
         if not self._has_base_features:
             return features
-        extract = super(ActorCriticPolicy, self).extract_features
-        return th.cat([features, extract(obs, self.base_features_extractor)], dim=-1)
+        base = super(ActorCriticPolicy, self).extract_features(obs, self.base_features_extractor)
+        if self._has_own_networks:
+            base = self.base_mlp_extractor.forward_actor(base)
+        return th.cat([features, base], dim=-1)
 
     @property
     def log_prob_stds(self) -> th.Tensor:

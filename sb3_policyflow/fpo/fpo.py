@@ -63,6 +63,7 @@ class FPOUpdate(FlowUpdate):
         losses = in_chunks(
             lambda part: self.losses(part, policy.actor_features(part.observations)),
             rollout._replace(drawn=drawn),
+            self.batch_size,
         )
         self.drawn = drawn._replace(reference_losses=losses)
 

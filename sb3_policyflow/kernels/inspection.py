@@ -64,11 +64,11 @@ class ModuleInspector:
         """All modules within a module."""
         return [self.child(module, name) for name in module._modules]
 
-    def buffer(self, module: nn.Module, name: str) -> Any:
-        """A tensor of a module that is not a parameter."""
-        tensor = module._buffers[name]
-        self._places.append((module._buffers, name, tensor))
-        return tensor
+    def parameter(self, module: nn.Module, name: str) -> Any:
+        """A parameter of a module."""
+        parameter = module._parameters[name]
+        self._places.append((module._parameters, name, parameter))
+        return parameter
 
     def layer(self, module: nn.Module) -> Layer:
         """The parameters of a module that is nothing but linear.

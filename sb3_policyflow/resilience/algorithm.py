@@ -46,6 +46,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     timeout_bootstrap: str = "terminal"
     """The value with which an episode cut by a time limit continues: that of the "terminal"
     observation, as in SB3, of the "current" one before it, or "none"."""
+    allow_nan_observations: bool = False
+    """Whether observations may have numbers that are not finite."""
 
     _callback: BaseCallback | None = None
     """The callback of the rollout that is being collected; its ``locals`` are the loop's."""
@@ -59,7 +61,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     def _guarded(self) -> Iterator[VecEnv]:
         """A block that uses the environment; names its faults and undoes what can be undone."""
         assert self.env is not None
-        self._step_checks = StepChecks(self.env)
+        self._step_checks = StepChecks(self.env, self.allow_nan_observations)
         watched = watch_workers(self.env, lambda: self.num_timesteps)
         with watched, rollback_statistics(self.get_vec_normalize_env()):
             yield self.env

@@ -1,0 +1,88 @@
+"""What users of SB3 give to its policies and a flow policy has not, and where to go instead."""
+
+import warnings
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
+from typing import Any
+
+OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
+FOREIGN_ARGUMENTS = {
+    "full_std": OF_GSDE,
+    "use_expln": OF_GSDE,
+    "squash_output": (
+        "it belongs to gSDE, which flow policies do not support. Leave it out: actions are clipped "
+        "to their bounds, to which DPPO with process='ddpm' scales them."
+    ),
+    "log_std_init": (
+        "only PolicyFlow has Gaussian noise that is learned. That of FPO is action_noise_std, that "
+        "of DPPO min_sampling_std."
+    ),
+}
+"""Arguments of SB3's actor-critic policies that some or all flow policies do not have, and why."""
+
+NOT_CALLED = {
+    "_get_action_dist_from_latent": (
+        "a flow policy has no distribution with a likelihood: override sample_actions, or "
+        "_build_actor for another velocity field"
+    ),
+    "reset_noise": "flow policies do not support gSDE: override sample_actions",
+}
+"""Methods of SB3's policies that nothing would ever call, and what to override instead."""
+
+NOT_CALLED_BY_TRAINING = ("evaluate_actions", "get_distribution")
+"""Methods of SB3's policies that PPO trains with, and flow algorithms do not."""
+
+
+def check_overridden_methods(policy_class: type[Any], base: type[Any]) -> None:
+    """Refuse a policy class with methods that nothing calls, and warn of those that seldom are.
+
+    :param policy_class: The class.
+    :param base: The base of all flow policies.
+    :raises TypeError: With the method to override instead.
+    """
+
+    def overrides(name: str) -> bool:
+        return getattr(policy_class, name) is not getattr(base, name)
+
+    for name, instead in NOT_CALLED.items():
+        if overrides(name):
+            raise TypeError(f"{policy_class.__name__} overrides {name}, but {instead}.")
+    for name in filter(overrides, NOT_CALLED_BY_TRAINING):
+        warnings.warn(
+            f"{policy_class.__name__} overrides {name}, which the flow algorithms do not call: "
+            "what they train on is in the terms of their update_class.",
+            stacklevel=4,
+        )
+
+
+def unknown_argument(
+    owner: str, name: str, own: Collection[str], of_policy: Collection[str] = ()
+) -> TypeError:
+    """An error that says where an argument that does not exist belongs.
+
+    :param owner: Who does not have it.
+    :param name: The argument.
+    :param own: Names of the arguments that the owner has.
+    :param of_policy: Names of those of the owner's policy, if that is another.
+    """
+    if name in of_policy:
+        return TypeError(
+            f"{name} is an option of {owner}'s policy: give it in policy_kwargs, as "
+            f"{owner}(..., policy_kwargs=dict({name}=...))."
+        )
+    if name in FOREIGN_ARGUMENTS:
+        return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
+    similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
+    places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
+    advice = f"Did you mean {_either(places)}?" if places else f"See help({owner}) for those it has."
+    return TypeError(f"{owner} has no argument {name!r}. {advice}")
+
+
+def _either(names: Iterable[str]) -> str:
+    """The names in a sentence.
+
+    >>> _either(["a", "b", "c"])
+    'a, b or c'
+    """
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
