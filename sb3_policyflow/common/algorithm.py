@@ -6,7 +6,6 @@ from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 
@@ -18,7 +17,10 @@ from sb3_policyflow.common.optimization import clip_gradients
 from sb3_policyflow.common.options import (
     FORMER_NAMES,
     SHARED_CHECKS,
+    PolicyOption,
     check_algorithm,
+    note_changed_options,
+    own_options,
     read_loaded_options,
 )
 from sb3_policyflow.common.policies import FlowPolicy
@@ -66,6 +68,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     trust_region: str = "ppo"
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for option in own_options(cls.policy_base):
+            setattr(cls, option.name, PolicyOption(option.name))
 
     def __init__(
         self,
@@ -154,13 +161,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        start = self.lr_schedule(1.0)
-        if self.desired_kl is None:
-            self.adaptive_learning_rate = None
-        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
-            # Otherwise a saved run continues that began with this learning rate.
-            self.adaptive_learning_rate = start
-        self._adaptive_start = start
+        self._start_adaptive_learning_rate()
         for check in self.model_checks:
             check(self)
 
@@ -181,9 +182,19 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         # linear schedule with it: a negative learning rate would ascend the loss.
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
 
+    def _start_adaptive_learning_rate(self) -> None:
+        """Start with ``learning_rate``, unless a run continues that started with it."""
+        start = self.lr_schedule(1.0)
+        if self.desired_kl is None:
+            self.adaptive_learning_rate = None
+        elif self.adaptive_learning_rate is None or start != self._adaptive_start:
+            self.adaptive_learning_rate = start
+        self._adaptive_start = start
+
     def _update_learning_rate(
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
+        self._start_adaptive_learning_rate()
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)
             return
@@ -280,6 +291,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
+        reason = reason_kernels_are_off(self.policy) if self.n_rollouts == 1 else None
+        if reason is not None:
+            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
@@ -292,12 +306,10 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(*args, **kwargs)
-        reason = reason_kernels_are_off(self.policy)
-        if reason is not None and self.num_timesteps == 0:
-            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
-        return prepared
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
+        note_changed_options(self)
+        super().save(path, exclude, include)
 
     def learn(
         self: SelfFlow,

@@ -191,6 +191,22 @@ def _policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
     return found
 
 
+class PolicyOption:
+    """An option of the policy as an attribute of its algorithm: setting it has its effect.
+
+    :param name: The option.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, owner: type[Any] | None = None) -> Any:
+        return self if model is None else getattr(model.policy, self._name)
+
+    def __set__(self, model: Any, value: object) -> None:
+        model.policy.change_option(self._name, value)
+
+
 def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
     """Let a policy take options under their former names too, with a warning.
 
@@ -240,6 +256,18 @@ def with_present_names(
         present[name] = FORMER_VALUES[name, former]
         _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
     return present
+
+
+def note_changed_options(model: Any) -> None:
+    """Take up into ``policy_options`` what has been changed on the policy itself.
+
+    :param model: An algorithm that is about to be saved.
+    """
+    given = {**model.policy_kwargs, **model.policy_options}
+    for option in own_options(model.policy_base):
+        value = getattr(model.policy, option.name)
+        if value != given.get(option.name, option.default):
+            model.policy_options[option.name] = value
 
 
 def read_loaded_options(model: Any) -> None:

@@ -76,6 +76,9 @@ class FlowPolicy(ActorCriticPolicy):
         "initialization": checks.one_of(INITIALIZATIONS),
     }
 
+    fixed_options: ClassVar[frozenset[str]] = frozenset()
+    """Own options that cannot change, because networks or parameters were made with them."""
+
     velocity: VelocityField
     mlp_extractor: MlpExtractor
 
@@ -134,6 +137,27 @@ class FlowPolicy(ActorCriticPolicy):
             del data[foreign]
         own = [option.name for option in own_options(type(self)) if hasattr(self, option.name)]
         return {**data, **{name: getattr(self, name) for name in (*self.shared_options, *own)}}
+
+    def change_option(self, name: str, value: object) -> None:
+        """Change an own option of the policy, which has its effect at once.
+
+        :param name: The option.
+        :param value: Its value.
+        :raises AttributeError: If the networks were made with it.
+        :raises ValueError: If it cannot have this value.
+        """
+        if name in self.fixed_options:
+            raise AttributeError(
+                f"{name} cannot change, because the policy was made with it: save the model and "
+                f"load it with load(file, {name}={value!r}), or make another one."
+            )
+        former = getattr(self, name)
+        setattr(self, name, value)
+        try:
+            checks.check_options(self)
+        except ValueError:
+            setattr(self, name, former)
+            raise
 
     @property
     def action_dim(self) -> int:

@@ -72,6 +72,9 @@ class DPPOPolicy(FlowPolicy):
         "noise_clip": checks.positive_or_none,
         "denoised_clip": checks.positive,
     }
+    fixed_options = frozenset(
+        {"process", "n_denoising_steps", "n_finetuned_steps", "denoised_clip", "identity_skip"}
+    )
 
     def __init__(
         self,
