@@ -217,6 +217,15 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             model._saved_random_states = state.random_states
         return model
 
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed the generators; see SB3. Those that ``load`` has found are forgotten.
+
+        :param seed: The seed; nothing happens without one.
+        """
+        super().set_random_seed(seed)
+        if seed is not None:
+            self._saved_random_states = None
+
     def _continue_episodes(self, state: ResumeState | None) -> None:
         """Check an environment that is not reset against the last observations."""
         if self.env is None or self._last_episode_starts is None:
