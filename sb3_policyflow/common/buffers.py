@@ -72,7 +72,7 @@ class RecordBufferMixin(RolloutBuffer):
         for name, values in record._asdict().items():
             getattr(self, name)[self.pos] = values.cpu().numpy()
         # NaN shows at once where log probabilities are read from this buffer by mistake.
-        no_log_prob = th.full((self.n_envs,), th.nan)
+        no_log_prob = th.full((self.n_envs,), th.nan, dtype=th.float32, device="cpu")
         super().add(obs, action, reward, episode_start, value, no_log_prob)
 
     def _allocate(self, record: Any) -> None:
