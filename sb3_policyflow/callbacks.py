@@ -104,7 +104,7 @@ class FlowDiagnosticsCallback(BaseCallback):
 
     def _sample(self) -> FlowRolloutBufferSamples:
         samples = self.algorithm.rollout_buffer.samples()
-        chosen = th.randperm(len(samples.actions))[: self.n_samples]
+        chosen = th.randperm(len(samples.actions), device="cpu")[: self.n_samples]
         return rows(samples, chosen.to(samples.actions.device))
 
     def _on_rollout_start(self) -> None:

@@ -42,8 +42,9 @@ class NormalizeObservation(nn.Module):
     def __init__(self, normalize: VecNormalize, key: str | None = None) -> None:
         super().__init__()
         statistics: Any = normalize.obs_rms if key is None else normalize.obs_rms[key]
-        self.register_buffer("mean", th.as_tensor(statistics.mean))
-        self.register_buffer("std", th.as_tensor(np.sqrt(statistics.var + normalize.epsilon)))
+        self.register_buffer("mean", th.as_tensor(statistics.mean, device="cpu"))
+        std = np.sqrt(statistics.var + normalize.epsilon)
+        self.register_buffer("std", th.as_tensor(std, device="cpu"))
         self.clip = float(normalize.clip_obs)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -77,8 +78,8 @@ class ActionModule(nn.Module):
         self.normalizers = nn.ModuleDict(_normalizers(self.policy.observation_space, normalize))
         box = self.policy.action_space
         assert isinstance(box, spaces.Box)
-        self.register_buffer("low", th.as_tensor(box.low, dtype=th.float32))
-        self.register_buffer("high", th.as_tensor(box.high, dtype=th.float32))
+        for name, bound in (("low", box.low), ("high", box.high)):
+            self.register_buffer(name, th.as_tensor(bound, dtype=th.float32, device="cpu"))
 
     def forward(self, observations: Observations, latents: th.Tensor | None = None) -> th.Tensor:
         """Compute actions.
@@ -117,13 +118,13 @@ class ActionModule(nn.Module):
             observations = self._zeros("all", space)
         if not latents:
             return (observations,)
-        return observations, th.zeros(2, self.policy.action_dim)
+        return observations, th.zeros(2, self.policy.action_dim, dtype=th.float32, device="cpu")
 
     def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
         """Zeros of the dtype that the input has: float32 if it is normalized in the graph."""
         assert space.shape is not None
         dtype = np.float32 if key in self.normalizers else space.dtype
-        return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype))
+        return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype), device="cpu")
 
 
 def _normalizers(

@@ -79,7 +79,7 @@ class RecordBufferMixin(RolloutBuffer):
             reward = self.pending_bonus.settle(reward)
             self.pending_bonus = None
         # NaN shows at once where log probabilities are read from this buffer by mistake.
-        no_log_prob = th.full((self.n_envs,), th.nan)
+        no_log_prob = th.full((self.n_envs,), th.nan, dtype=th.float32, device="cpu")
         super().add(obs, action, reward, episode_start, value, no_log_prob)
 
     def _allocate(self, record: Any) -> None:

@@ -97,7 +97,8 @@ def penalized_surrogate(
     """
     ratio = log_ratio.exp()
     # A schedule may end at 0, where the old policy alone is allowed.
-    width = th.as_tensor(clip_range).clamp_min(SMALLEST_CLIP_RANGE)
+    width = th.as_tensor(clip_range, dtype=log_ratio.dtype, device=log_ratio.device)
+    width = width.clamp_min(SMALLEST_CLIP_RANGE)
     return ratio * advantages - advantages.abs() / (2 * width) * (ratio - 1) ** 2
 
 

@@ -43,11 +43,13 @@ class DPPOUpdate(FlowUpdate):
             algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
         )
         self.stds = self.policy.log_prob_stds
-        steps_left = th.arange(len(self.stds), device=self.stds.device).flip(0)
+        n_steps = len(self.stds)
+        like_stds: Any = {"device": self.stds.device, "dtype": self.stds.dtype}
+        steps_left = th.arange(n_steps, **like_stds).flip(0)
         self.surrogate_weights = algorithm.denoising_gamma**steps_left
         if algorithm.clip_range_base is not None:
             # From 0 to 1 over the trained steps; a single step is a last one.
-            position = th.linspace(1, 0, len(self.stds), device=self.stds.device).flip(0)
+            position = th.linspace(1, 0, n_steps, **like_stds).flip(0)
             rate, base = algorithm.clip_range_rate, algorithm.clip_range_base
             rise = th.expm1(rate * position) / math.expm1(rate)
             self.clip_range = base + (self.clip_range - base) * rise

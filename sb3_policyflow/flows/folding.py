@@ -6,10 +6,12 @@ The middle term depends on time alone: a solver sees few times and needs a small
 depends on the observation alone: it is computed once for all times.
 """
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch as th
 from torch import nn
+from torch.nn.modules import module as torch_module
 
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.solvers import SOLVERS, solver_times
@@ -19,6 +21,13 @@ if TYPE_CHECKING:  # that module imports this one
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 """Attributes of a module that hold its hooks, by name; torch has no public way to ask for them."""
+GLOBAL_HOOKS: tuple[Mapping[int, object], ...] = (
+    torch_module._global_forward_hooks,
+    torch_module._global_forward_pre_hooks,
+    torch_module._global_backward_hooks,
+    torch_module._global_backward_pre_hooks,
+)
+"""Hooks of all modules, in torch's own dictionaries."""
 
 
 def has_hooks(module: nn.Module) -> bool:
@@ -31,7 +40,9 @@ def has_hooks(module: nn.Module) -> bool:
     >>> has_hooks(layer), has_hooks(nn.Linear(1, 1))
     (True, False)
     """
-    return "forward" in vars(module) or any(getattr(module, name) for name in HOOKS)
+    if "forward" in vars(module) or any(GLOBAL_HOOKS):
+        return True
+    return any(getattr(module, name) for name in HOOKS)
 
 
 class FoldedLayer(NamedTuple):
@@ -62,15 +73,30 @@ def fold(field: "VelocityField", times: th.Tensor) -> FoldedLayer:
     """
     first = field.layers[0]
     assert isinstance(first, nn.Linear)
-    dim = field.output.out_features
-    of_points, of_embedding = first.weight[:, :dim], first.weight[:, dim:]
     observation = field.observation_embedding
     embeddings = field.time_embedding(times) + observation.bias
-    return FoldedLayer(
-        of_points,
-        of_embedding @ observation.weight,
-        nn.functional.linear(embeddings, of_embedding, first.bias),
-    )
+    dim = field.output.out_features
+    return split_first_layer(dim, first.weight, first.bias, observation.weight, embeddings)
+
+
+def split_first_layer(
+    dim: int,
+    weight: th.Tensor,
+    bias: th.Tensor,
+    observation_weight: th.Tensor,
+    embeddings: th.Tensor,
+) -> FoldedLayer:
+    """Split the first layer, given what it consists of.
+
+    :param dim: Dimensions of the points.
+    :param weight: W, shape (h, dim + embedding_dim).
+    :param bias: b, shape (h,).
+    :param observation_weight: W_o, shape (embedding_dim, features_dim).
+    :param embeddings: t_emb(t) + b_o of each time, shape (n_times, embedding_dim).
+    """
+    of_points, of_embedding = weight[:, :dim], weight[:, dim:]
+    table = nn.functional.linear(embeddings, of_embedding, bias)
+    return FoldedLayer(of_points, of_embedding @ observation_weight, table)
 
 
 def integrate_folded(

@@ -173,7 +173,7 @@ def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
     if n_steps < 1:
         raise ValueError(f"A flow needs at least one solver step, got n_flow_steps={n_steps}.")
     n_parts = choose("solver", solver, SOLVERS).grid_points_per_step * n_steps
-    return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64)
+    return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64, device="cpu")
 
 
 def integrate(

@@ -54,9 +54,16 @@ class FourierTimeEmbedding(nn.Module):
 
     def forward(self, times: th.Tensor) -> th.Tensor:
         """Embed times of shape (...) into shape (..., embedding_dim)."""
-        phases = 2 * math.pi * times.unsqueeze(-1) * self.frequencies.detach()
-        embedding: th.Tensor = self.mlp(th.cat([phases.cos(), phases.sin()], dim=-1))
-        return embedding
+        inputs = fourier_features(times, self.frequencies.detach())
+        # Other linear layers than torch's, such as quantized ones, take nothing but rows.
+        embedding: th.Tensor = self.mlp(inputs if times.dim() > 0 else inputs.unsqueeze(0))
+        return embedding.view(*times.shape, embedding.shape[-1])
+
+
+def fourier_features(times: th.Tensor, frequencies: th.Tensor) -> th.Tensor:
+    """Cosines and sines of times of shape (...), shape (..., 2 n_frequencies)."""
+    phases = 2 * math.pi * times.unsqueeze(-1) * frequencies
+    return th.cat([phases.cos(), phases.sin()], dim=-1)
 
 
 def _given_or_drawn(frequencies: object, scale: float) -> th.Tensor:

@@ -58,7 +58,7 @@ class FPOUpdate(FlowUpdate):
         n_samples, action_dim = rollout.actions.shape
         sampler = TIME_SAMPLERS[algorithm.time_sampler](policy.flow.times())
         times = sampler.sample(n_samples, algorithm.n_mc_samples)
-        noises = th.randn(*times.shape, action_dim, device=times.device)
+        noises = th.randn(*times.shape, action_dim, device=times.device, dtype=times.dtype)
         drawn = MonteCarloSamples(times, noises, times.new_empty(times.shape))
         losses = in_chunks(
             lambda part: self.losses(part, policy.actor_features(part.observations)),

@@ -37,10 +37,13 @@ from sb3_policyflow.kernels.mlp import (
 class FieldParts:
     """What a velocity field consists of, and all tensors that it depends on.
 
+    ``held`` are these tensors for those who read memory, see :class:`~.mlp.MLP`.
+
     :param frequencies: Those of the time embedding.
     :param time: The time embedding's two layers.
     :param observation: The observation embedding.
     :param network: The rest.
+    :raises UnsupportedError: If their shapes do not fit each other.
     """
 
     def __init__(self, frequencies: th.Tensor, time: MLP, observation: Layer, network: MLP) -> None:
@@ -54,24 +57,27 @@ class FieldParts:
         self.embedding = [*time.tensors, *observation, *network.layers[0]]
         self.parameters = [*self.embedding, *network.tensors[2:]]
         self.tensors = [frequencies, *self.parameters]
-        self.shapes = [tensor.shape for tensor in self.tensors]
+        embedding = [*time.held, *(tensor.detach() for tensor in observation), *network.held[:2]]
+        self.held = [frequencies.detach(), *embedding, *network.held[2:]]
+        self.shapes = [tensor.shape for tensor in self.held]
+        self.places = [tensor.data_ptr() for tensor in self.held]
+        self._require_fit()
+        self.layout = FieldLayout(
+            self.dim, *time.activation, len(frequencies), self.places[0], *self.places[1:9]
+        )
+
+    def _require_fit(self) -> None:
+        (n_frequencies,), width = self.shapes[0], self.time.n_outputs
+        expected = (2 * n_frequencies, (width, self.features_dim), (width,), self.dim + width)
+        weight, bias = self.shapes[5:7]
+        if (self.time.n_inputs, weight, bias, self.network.n_inputs) != expected:
+            raise UnsupportedError("the shapes of the velocity field's layers do not fit")
 
     def supports(self, points: th.Tensor, features: th.Tensor) -> bool:
         """Whether points and features are those of kernels, and of this field."""
         dims = points.shape[-1], features.shape[-1]
         is_known = dims == (self.dim, self.features_dim) and points.numel() > 0
         return is_known and are_usable((points, features))
-
-    def layout(self) -> FieldLayout:
-        """Where the embeddings and the first layer are in memory now."""
-        return FieldLayout(
-            self.dim,
-            self.time.activation.kind,
-            self.time.activation.alpha,
-            len(self.frequencies),
-            self.frequencies.data_ptr(),
-            *[tensor.data_ptr() for tensor in self.embedding],
-        )
 
 
 def _read_field(kernels: Kernels, inspector: ModuleInspector, field: VelocityField) -> FieldParts:
@@ -137,7 +143,7 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
         if self.has_formula_of_paper and is_matrix and not th.is_grad_enabled():
             parts = self.parts()
             if not isinstance(parts, str) and parts.supports(latents, features):
-                plan = self._plans.get(self, parts, solver, n_steps, end_time)
+                plan = self._plans.get(parts, solver, n_steps, end_time)
                 return plan.transport(latents, features)
         return super().integrate(
             latents, features, solver=solver, n_steps=n_steps, end_time=end_time
@@ -162,7 +168,7 @@ class _Embedding:
             np.empty((len(features), width), dtype=np.float32),
             *np.empty((3, n_times, size), dtype=np.float32),
         )
-        n_distinct = parts.kernels.embed(distinct, features, parts.layout(), self._first)
+        n_distinct = parts.kernels.embed(distinct, features, parts.layout, self._first)
         self._times = distinct[:n_distinct]
 
     def kernel_input(self, points: Floats, times_shape: th.Size, leading: th.Size) -> KernelInput:
@@ -189,7 +195,7 @@ class _Embedding:
         self._parts.kernels.embed_backward(
             self._times,
             self._features,
-            self._parts.layout(),
+            self._parts.layout,
             self._first,
             FieldGradients(
                 gradients.points.numpy(),

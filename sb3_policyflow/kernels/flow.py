@@ -1,16 +1,16 @@
 """The flow from latents to end points in one call of a kernel."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch as th
 
-from sb3_policyflow.flows import SOLVERS, Solver, VelocityField
-from sb3_policyflow.flows.folding import fold
+from sb3_policyflow.flows import SOLVERS, Solver
+from sb3_policyflow.flows.folding import split_first_layer
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
+from sb3_policyflow.flows.velocity import fourier_features
+from sb3_policyflow.kernels.inspection import addresses
 from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Integers, Kernels, Method
-from sb3_policyflow.kernels.mlp import MLP
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
 if TYPE_CHECKING:  # that module imports this one
@@ -44,81 +44,95 @@ class FlowPlan(NamedTuple):
 class FlowPlans:
     """The plans of a field, kept for as long as its weights are the same.
 
-    A copy has no plans: it derives them from the weights that it finds.
+    A copy has no plans: it derives them from the weights that it finds. Threads may share plans:
+    they change by one assignment.
     """
 
     def __init__(self) -> None:
-        self._snapshot = Snapshot()
-        self._parts: FieldParts | None = None
-        self._plans: dict[tuple[str, int, float], FlowPlan] = {}
+        self._snapshot: _Snapshot | None = None
 
     def __reduce__(self) -> Any:
         return type(self), ()
 
-    def get(
-        self, field: VelocityField, parts: "FieldParts", solver: str, n_steps: int, end_time: float
-    ) -> FlowPlan:
+    def get(self, parts: "FieldParts", solver: str, n_steps: int, end_time: float) -> FlowPlan:
         """Return the plan for a solver.
 
-        :param field: The velocity field.
-        :param parts: Its parts, as they are now.
+        :param parts: The parts of the field, as they are now.
         :param solver: Name of the solver.
         :param n_steps: Number of equal steps.
         :param end_time: Where the flow ends.
         :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
         """
-        is_outdated = self._snapshot.update(parts.kernels, parts.tensors)
-        if is_outdated or parts is not self._parts:
-            self._parts = parts
-            self._plans.clear()
+        snapshot = self._snapshot
+        if snapshot is None or not snapshot.is_current(parts):
+            snapshot = self._snapshot = _Snapshot(parts)
+        return snapshot.plan(solver, n_steps, end_time)
+
+
+class _Snapshot:
+    """A copy of a field's weights, and the plans that were derived from this copy.
+
+    The weights are compared with it bit by bit: however they were changed, what was derived from
+    others cannot be used by mistake. They may change while they are copied. Then the copy is a
+    mixture, and the next comparison says so.
+
+    :param parts: The parts of the field.
+    """
+
+    def __init__(self, parts: "FieldParts") -> None:
+        self._parts = parts
+        self._copies = [tensor.clone() for tensor in parts.held]
+        self._arguments = (
+            addresses(parts.held),
+            addresses(self._copies),
+            np.array([tensor.numel() for tensor in parts.held]),
+        )
+        self._plans: dict[tuple[str, int, float], FlowPlan] = {}
+
+    def is_current(self, parts: "FieldParts") -> bool:
+        """Whether the field has these parts and they are what they were."""
+        return parts is self._parts and parts.kernels.are_same(*self._arguments)
+
+    def plan(self, solver: str, n_steps: int, end_time: float) -> FlowPlan:
+        """Return the plan for a solver, see :meth:`FlowPlans.get`."""
         key = (solver, n_steps, end_time)
         plan = self._plans.get(key)
         if plan is None:
-            if len(self._plans) == MAX_PLANS:
+            plan = _make_plan(self._parts, self._copies, *key)
+            if len(self._plans) >= MAX_PLANS:
                 self._plans.clear()
-            plan = self._plans[key] = _make_plan(field, parts.network, *key)
+            self._plans[key] = plan
         return plan
-
-
-class Snapshot:
-    """A copy of some tensors, compared with them bit by bit.
-
-    However they were changed, what was derived from them cannot be used by mistake.
-    """
-
-    def __init__(self) -> None:
-        self._places: list[int] = []
-
-    def update(self, kernels: Kernels, tensors: Sequence[th.Tensor]) -> bool:
-        """Copy the tensors, and say whether the copy was out of date."""
-        places = [tensor.data_ptr() for tensor in tensors]
-        if places != self._places:
-            sizes = [tensor.numel() for tensor in tensors]
-            self._places = places
-            self._arguments = (
-                np.array(places),
-                np.array(sizes),
-                np.full(sum(sizes), -1, dtype=np.int32),
-            )
-        return kernels.update_copy(*self._arguments)
 
 
 @th.no_grad()
 def _make_plan(
-    field: VelocityField, network: MLP, solver: str, n_steps: int, end_time: float
+    parts: "FieldParts", weights: list[th.Tensor], solver: str, n_steps: int, end_time: float
 ) -> FlowPlan:
+    """Make a plan for a solver.
+
+    :param parts: What the field consists of.
+    :param weights: A copy of its tensors, of which nothing changes.
+    """
+    network, linear = parts.network, th.nn.functional.linear
+    frequencies, time_weight, time_bias, output_weight, output_bias = weights[:5]
+    observation_weight, observation_bias, first_weight, first_bias = weights[5:9]
     times = solver_times(solver, n_steps, end_time).float()
     time_indices, tableau = _tableau(SOLVERS[solver], n_steps, end_time)
-    first, output = fold(field, times), network.layers[-1]
-    between = [t for weight, bias in network.layers[1:-1] for t in (weight.T, bias)]
-    hidden = [part.reshape(-1) for part in between]
+    hidden = linear(fourier_features(times, frequencies), time_weight, time_bias)
+    embeddings = linear(parts.time.modules[1](hidden), output_weight, output_bias)
+    first = split_first_layer(
+        parts.dim, first_weight, first_bias, observation_weight, embeddings + observation_bias
+    )
+    *between, weight, bias = weights[9:]
+    flat = [(part.T if part.dim() == 2 else part).reshape(-1) for part in between]
     folded = FoldedNetwork(
         points=first.points.T.contiguous().numpy(),
         features=first.features.T.contiguous().numpy(),
-        hidden=(th.cat(hidden) if hidden else th.zeros(0)).numpy(),
+        hidden=th.cat(flat).numpy() if flat else np.zeros(0, dtype=np.float32),
         widths=network.widths,
-        output=output.weight.numpy().copy(),
-        bias=output.bias.numpy().copy(),
+        output=weight.numpy(),
+        bias=bias.numpy(),
         kind=network.activation.kind,
         alpha=np.float32(network.activation.alpha),
     )

@@ -1,13 +1,15 @@
 """Which modules the kernels can work on, and where their parameters are."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch as th
 from torch import nn
+from torch.utils._device import DeviceContext
 
-from sb3_policyflow.flows.folding import HOOKS, has_hooks
+from sb3_policyflow.flows.folding import GLOBAL_HOOKS, HOOKS, has_hooks
 from sb3_policyflow.kernels.activations import PLAIN, WITH_ALPHA, Activation
 from sb3_policyflow.kernels.compiler import load_kernels, note_fallback
 from sb3_policyflow.kernels.layouts import Integers, Kernels
@@ -66,14 +68,16 @@ class ModuleInspector:
 
     def parameter(self, module: nn.Module, name: str) -> Any:
         """A parameter of a module."""
-        parameter = module._parameters[name]
+        parameter: Any = module._parameters[name]
         self._places.append((module._parameters, name, parameter))
+        require_usable(parameter)
         return parameter
 
     def layer(self, module: nn.Module) -> Layer:
         """The parameters of a module that is nothing but linear.
 
-        :raises UnsupportedError: If it is something else, or has no bias.
+        :raises UnsupportedError: If it is something else, has no bias, or has parameters that
+            kernels cannot work on.
         """
         if type(module) is not nn.Linear:
             raise UnsupportedError(f"{type(module).__name__} takes the place of a linear layer")
@@ -83,6 +87,7 @@ class ModuleInspector:
         if weight is None or bias is None:
             raise UnsupportedError("a linear layer has no weight or no bias of its own")
         self._places += [(parameters, "weight", weight), (parameters, "bias", bias)]
+        require_usable(weight, bias)
         return Layer(weight, bias)
 
     def activation(self, module: nn.Module) -> Activation:
@@ -106,17 +111,38 @@ class ModuleInspector:
 
 
 class Parts(Protocol):
-    """What a module consists of."""
+    """What a module consists of, as it was at one moment; nothing of it changes."""
 
-    kernels: Kernels
-    """The kernels that work on it."""
     tensors: list[th.Tensor]
     """All tensors that its outputs depend on."""
     shapes: list[th.Size]
     """Their shapes when they were read."""
+    places: list[int]
+    """Where they were then. The parts hold on to this memory."""
 
 
 P = TypeVar("P", bound=Parts)
+
+
+@dataclass(frozen=True)
+class _Reading(Generic[P]):
+    """What was read from a module, complete: threads see all of it or nothing."""
+
+    module: object
+    inspector: ModuleInspector
+    parts: P
+
+    def is_current(self, module: object) -> bool:
+        """Whether the module, if it is this one, would be read like this again."""
+        if module is not self.module or not self.inspector.is_current():
+            return False
+        # Setting parameter.data can change all of a tensor and leave it the same object.
+        parts = self.parts
+        return (
+            are_usable(parts.tensors)
+            and [tensor.data_ptr() for tensor in parts.tensors] == parts.places
+            and [tensor.shape for tensor in parts.tensors] == parts.shapes
+        )
 
 
 class KernelView(Generic[P]):
@@ -125,55 +151,61 @@ class KernelView(Generic[P]):
     The module is read again when it has changed. Values of parameters are not part of that; the
     tensors are. A copy of a view is an empty one, so that what holds it can be copied and pickled.
 
+    Threads may share a view: it changes by one assignment of a reading that is complete.
+
     :param read: Reads a module for these kernels, or raises :class:`UnsupportedError`.
     """
 
     def __init__(self, read: Callable[[Kernels, ModuleInspector, Any], P]) -> None:
         self._read = read
-        self._inspector = ModuleInspector()
-        self._module: object = None
-        self._parts: P | None = None
+        self._reading: _Reading[P] | None = None
 
     def __reduce__(self) -> Any:
         return type(self), (self._read,)
 
     def of(self, module: Any) -> P | str:
         """The parts of a module as it is now, or the reason why kernels cannot work on it."""
-        if not is_eager():
-            return "it is being compiled, exported or traced"
-        kernels = load_kernels()
-        found = kernels if isinstance(kernels, str) else self._current_parts(kernels, module)
-        if isinstance(found, str):
-            note_fallback(found)
-        return found
-
-    def _current_parts(self, kernels: Kernels, module: Any) -> P | str:
-        parts = self._parts
-        if parts is None or module is not self._module or not self._inspector.is_current():
-            self._module, self._inspector, self._parts = module, ModuleInspector(), None
+        kernels = why_torch_must_work() or load_kernels()
+        if isinstance(kernels, str):
+            note_fallback(kernels)
+            return kernels
+        reading = self._reading
+        if reading is None or not reading.is_current(module):
+            inspector = ModuleInspector()
             try:
-                parts = self._parts = self._read(kernels, self._inspector, module)
+                parts = self._read(kernels, inspector, module)
             except UnsupportedError as unsupported:
+                note_fallback(str(unsupported))
                 return str(unsupported)
-        # Setting parameter.data can change all of a tensor and leave it the same object.
-        if not (has_same_shapes(parts.tensors, parts.shapes) and are_usable(parts.tensors)):
-            return why_unusable(parts.tensors)
-        return parts
+            reading = self._reading = _Reading(module, inspector, parts)
+        return reading.parts
 
 
-def is_eager() -> bool:
-    """Whether tensors have values, which they have not for those who compile, export or trace."""
-    return not th.compiler.is_compiling() and th._C._get_tracing_state() is None
+def why_torch_must_work() -> str | None:
+    """The reason why no kernel can take the place of torch's functions now, whatever the module."""
+    # Tensors have no values for those who compile, export or trace.
+    if th.compiler.is_compiling() or th._C._get_tracing_state() is not None:
+        return "it is being compiled, exported or traced"
+    # Within torch.func's transformations tensors stand for others, and autocast wants another type.
+    if th._C._functorch.peek_interpreter_stack() is not None or th.is_autocast_enabled("cpu"):
+        return "torch.func or autocast is at work"
+    if any(GLOBAL_HOOKS):
+        return "there are hooks for all modules"
+    if th._C._len_torch_dispatch_stack() > 0 or _has_function_mode():
+        return "a mode takes part in torch's functions"
+    return None
 
 
 def has_values() -> bool:
     """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
-    return is_eager() and th._C._functorch.peek_interpreter_stack() is None
+    is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
+    return not is_traced and th._C._functorch.peek_interpreter_stack() is None
 
 
-def has_same_shapes(tensors: Iterable[th.Tensor], shapes: list[th.Size]) -> bool:
-    """Whether tensors have the shapes that they were read in."""
-    return [tensor.shape for tensor in tensors] == shapes
+def _has_function_mode() -> bool:
+    """Whether there is a mode for torch's functions other than that of the default device."""
+    modes = range(th._C._len_torch_function_stack())
+    return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:
@@ -181,21 +213,24 @@ def are_usable(tensors: Iterable[th.Tensor]) -> bool:
     for tensor in tensors:
         if tensor.dtype is not th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
             return False
-    # Within torch.func's transformations tensors stand for others, and autocast wants another type.
-    is_transformed = th._C._functorch.peek_interpreter_stack() is not None
-    return not (is_transformed or th.is_autocast_enabled("cpu"))
+    return True
 
 
-def why_unusable(tensors: Iterable[th.Tensor]) -> str:
-    """The reason why kernels cannot work on parameters: see :func:`are_usable`."""
+def require_usable(*tensors: th.Tensor) -> None:
+    """Refuse tensors that kernels cannot work on.
+
+    :raises UnsupportedError: If there is one, see :func:`are_usable`, or one of another class,
+        which may have no memory of its own.
+    """
     for tensor in tensors:
+        if type(tensor) not in (th.Tensor, nn.Parameter):
+            raise UnsupportedError(f"a {type(tensor).__name__} takes the place of a parameter")
         if not tensor.is_cpu:
-            return f"the policy is on {tensor.device.type}"
+            raise UnsupportedError(f"the policy is on {tensor.device.type}")
         if tensor.dtype is not th.float32:
-            return f"parameters are {tensor.dtype}, not torch.float32"
+            raise UnsupportedError(f"parameters are {tensor.dtype}, not torch.float32")
         if not tensor.is_contiguous():
-            return "parameters are not contiguous"
-    return "parameters have changed their shapes, or torch.func or autocast is at work"
+            raise UnsupportedError("parameters are not contiguous")
 
 
 def addresses(tensors: Iterable[th.Tensor]) -> Integers:

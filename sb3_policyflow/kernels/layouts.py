@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
-Bits = NDArray[np.int32]
 
 
 class KernelInput(NamedTuple):
@@ -206,8 +205,8 @@ class Kernels(Protocol):
     ) -> None:
         """Carry some rows of latents to their end points."""
 
-    def update_copy(self, addresses: Integers, sizes: Integers, copy: Bits) -> bool:
-        """Copy arrays, and say whether the copy was out of date."""
+    def are_same(self, addresses: Integers, others: Integers, sizes: Integers) -> bool:
+        """Whether arrays have the bits of others."""
 
     def clip(self, addresses: Integers, sizes: Integers, max_norm: float) -> float:
         """Clip arrays to a norm of all together, and return the norm that they had."""

@@ -30,12 +30,17 @@ NO_INDEX: Integers = np.zeros(0, dtype=np.int64)
 
 
 class MLP:
-    """Linear layers, at least two, with one activation between them.
+    """Linear layers, at least two, with one activation between them, as they are when it is made.
+
+    Weights may change, and are read where they are; the place does not change. ``held`` are the
+    parameters as they were, without gradient: they keep that place, which another thread may take
+    from the parameters by setting their ``data``.
 
     :param kernels: The kernels.
     :param modules: The layers and activations.
     :param layers: The layers' parameters.
     :param activation: The activation.
+    :raises UnsupportedError: If the shapes of the layers do not fit each other.
     """
 
     def __init__(
@@ -50,16 +55,23 @@ class MLP:
         self.layers = layers
         self.activation = activation
         self.tensors = [tensor for layer in layers for tensor in layer]
-        self.shapes = [tensor.shape for tensor in self.tensors]
-        self.n_inputs = layers[0].weight.shape[1]
-        widths = [len(layer.bias) for layer in layers]
+        self.held = [tensor.detach() for tensor in self.tensors]
+        self.shapes = [tensor.shape for tensor in self.held]
+        self.places = [tensor.data_ptr() for tensor in self.held]
+        weights, biases = self.held[::2], self.held[1::2]
+        self.n_inputs = weights[0].shape[1]
+        widths = [bias.numel() for bias in biases]
+        sizes = zip(widths, [self.n_inputs, *widths], strict=False)
+        if [tuple(weight.shape) for weight in weights] != list(sizes):
+            raise UnsupportedError("the shapes of a network's layers do not fit each other")
         self.n_outputs = widths.pop()
         self.n_hidden = sum(widths)
         self.widths: Integers = np.array(widths)
-        self.flops_per_row = sum(layer.weight.numel() for layer in layers)
+        self.flops_per_row = sum(weight.numel() for weight in weights)
+        self.layout = self.layout_of(self.held)
 
-    def layout(self, parameters: Sequence[th.Tensor]) -> MLPLayout:
-        """Where the MLP is in memory.
+    def layout_of(self, parameters: Sequence[th.Tensor]) -> MLPLayout:
+        """Where an MLP of these shapes is in memory.
 
         :param parameters: Weight and bias of each layer.
         """
@@ -116,12 +128,12 @@ class Evaluation:
         :return: The outputs, shape (n, n_outputs), and what the backward pass needs.
         """
         network, first, n_rows = self._network, self._first, len(self._first.points)
-        outputs = th.empty(n_rows, network.n_outputs)
+        outputs = th.empty(n_rows, network.n_outputs, dtype=th.float32, device="cpu")
         # NumPy asks for huge pages. PyTorch does not, and FPO's updates spent a third of their time
         # waiting for small ones.
         n_saved = n_rows * network.n_hidden if saves else 0
         saved = th.from_numpy(np.empty((2, n_saved), dtype=np.float32))
-        layout, (values, derivatives) = network.layout(network.tensors), saved.numpy()
+        layout, (values, derivatives) = network.layout, saved.numpy()
         run, filled = network.kernels.forward, outputs.numpy()
         self._in_parts(
             lambda _, start, stop: run(first, layout, filled, values, derivatives, start, stop)
@@ -146,9 +158,9 @@ class Evaluation:
         n_points, (n_entries, width) = first.points.shape[1], first.table.shape
         sizes = [n_points * width, n_entries * width, *(p.numel() for p in parameters[2:])]
         # Each thread adds up its own; rows that share a shift belong to one thread.
-        flat = th.zeros(self._n_parts, sum(sizes))
+        flat = th.zeros(self._n_parts, sum(sizes), dtype=th.float32, device="cpu")
         shifts, of_thread = np.zeros_like(first.shifts), flat.numpy()
-        layout, (values, derivatives) = network.layout(parameters), saved.numpy()
+        layout, (values, derivatives) = network.layout_of(parameters), saved.numpy()
         outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
 
         def run_part(part: int, start: int, stop: int) -> None:
@@ -209,7 +221,7 @@ class _MLPEvaluation(th.autograd.Function):
 
 
 def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
-    bias = network.layers[0].bias.detach().numpy()
+    bias = network.held[1].numpy()
     no_shifts = np.zeros((0, bias.size), dtype=np.float32)
     points = inputs.detach().numpy()
     return Evaluation(

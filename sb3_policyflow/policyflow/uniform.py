@@ -34,8 +34,8 @@ class UniformTargets:
             )
         self._interpolant = interpolant
         self._latent_std = latent_std
-        self._low = th.as_tensor(action_space.low).flatten()
-        self._high = th.as_tensor(action_space.high).flatten()
+        self._low = th.as_tensor(action_space.low, device="cpu").flatten()
+        self._high = th.as_tensor(action_space.high, device="cpu").flatten()
 
     @classmethod
     def of(cls, policy: PolicyFlowPolicy) -> "UniformTargets":

@@ -120,7 +120,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
         """Values of the states with which episodes continue beyond their time limits."""
         if self.timeout_bootstrap == "none":
-            return th.zeros(len(indices))
+            return th.zeros(len(indices), dtype=th.float32, device="cpu")
         observations: Any = self._last_obs
         if self.timeout_bootstrap == "terminal":
             observations = terminal_observations(infos, indices, self.observation_space)

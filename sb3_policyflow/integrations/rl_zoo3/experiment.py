@@ -1,7 +1,11 @@
 """What an experiment of rl_zoo3 needs for this package's algorithms and environments."""
 
+import atexit
 import functools
+import shutil
+import tempfile
 from collections.abc import Callable, Container
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +15,6 @@ import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
-
-PACKAGE = Path(__file__).parents[2]
 
 
 def extend_experiment(manager: Any, own_algorithms: Container[str], config_given: bool) -> None:
@@ -54,10 +56,23 @@ def choose_config(algo: str, env_id: str, theirs: str) -> str:
     return str(ours) if only_ours else theirs
 
 
+@functools.cache
 def hyperparams_folder() -> Path:
-    """Where the YAML files are: in the installed package, or beside it in a checkout."""
-    installed = PACKAGE / "hyperparams"
-    return installed if installed.is_dir() else PACKAGE.parent / "hyperparams"
+    """Where the YAML files are: in the installed package, or beside it in a checkout.
+
+    rl_zoo3 reads files by their names, so those of a package in an archive are copied from there to
+    a temporary folder.
+    """
+    package = resources.files("sb3_policyflow")
+    if isinstance(package, Path):
+        installed = package / "hyperparams"
+        return installed if installed.is_dir() else package.parent / "hyperparams"
+    copies = Path(tempfile.mkdtemp(prefix="sb3_policyflow_hyperparams_"))
+    atexit.register(shutil.rmtree, copies, ignore_errors=True)
+    packed = package / "hyperparams"
+    for file in packed.iterdir() if packed.is_dir() else ():
+        (copies / file.name).write_bytes(file.read_bytes())
+    return copies
 
 
 def _environments(config: Path) -> set[str]:

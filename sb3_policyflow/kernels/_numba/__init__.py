@@ -7,15 +7,15 @@ a time through a network to stay in the caches. Get them from
 
 from sb3_policyflow.kernels._numba.embedding import embed, embed_backward
 from sb3_policyflow.kernels._numba.flow import flow
-from sb3_policyflow.kernels._numba.memory import clip, update_copy
+from sb3_policyflow.kernels._numba.memory import are_same, clip
 from sb3_policyflow.kernels._numba.mlp import backward, forward
 
 __all__ = [
+    "are_same",
     "backward",
     "clip",
     "embed",
     "embed_backward",
     "flow",
     "forward",
-    "update_copy",
 ]

@@ -7,9 +7,8 @@ import numpy as np
 from numba import carray, types
 from numba.extending import intrinsic
 
-from sb3_policyflow.kernels._numba.matrices import copy as copy_numbers
 from sb3_policyflow.kernels._numba.options import F, inner, kernel
-from sb3_policyflow.kernels.layouts import Bits, Floats, Integers
+from sb3_policyflow.kernels.layouts import Floats, Integers
 
 
 def _pointer_to(number: Any) -> Any:
@@ -43,21 +42,17 @@ def matrix(address: int, n_rows: int, n_columns: int) -> Floats:
 
 
 @kernel
-def update_copy(addresses: Integers, sizes: Integers, copy: Bits) -> bool:
-    """Copy the numbers at some addresses one behind the other; say whether a bit has changed."""
-    changed = False
-    start = 0
+def are_same(addresses: Integers, others: Integers, sizes: Integers) -> bool:
+    """Whether the numbers at some addresses have the bits of those at others."""
     for place in range(addresses.size):
         numbers = carray(_bits(addresses[place]), (sizes[place],))
-        target = copy[start : start + numbers.size]
-        start += numbers.size
+        other_numbers = carray(_bits(others[place]), (sizes[place],))
         difference = np.int32(0)
         for i in range(numbers.size):
-            difference |= numbers[i] ^ target[i]
+            difference |= numbers[i] ^ other_numbers[i]
         if difference != 0:
-            changed = True
-            copy_numbers(numbers, target)
-    return changed
+            return False
+    return True
 
 
 @kernel

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from sb3_policyflow.kernels._numba.caching import KernelCache
+
 F = np.float32
 ROWS = 64
 """Rows that are carried through a network together, see :mod:`~.tiles`.
@@ -15,15 +17,28 @@ the time of a flow or of gradients with hidden layers [256, 128, 64], and 0.89 t
 """
 
 # Divisions by zero give infinity, as in torch, and threads may run beside each other.
-_COMMON: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_COMMON: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 # What only kernels call needs no way in from Python, which takes time to compile.
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _EXACT: dict[str, Any] = {"fastmath": {"contract"}}
 _SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 
-kernel = njit(**_COMMON, **_SUMS)
+
+def _compiler(**options: Any) -> Any:
+    """A decorator for functions that numba compiles, and keeps for later processes."""
+
+    def decorate(function: Any) -> Any:
+        dispatcher = njit(**_COMMON, **options)(function)
+        # What njit(cache=True) does, with another class of cache.
+        dispatcher._cache = KernelCache(function)
+        return dispatcher
+
+    return decorate
+
+
+kernel = _compiler(**_SUMS)
 """Called from Python."""
-inner = njit(**_COMMON, **_INNER, **_SUMS)
+inner = _compiler(**_INNER, **_SUMS)
 """Called by kernels; adds up in any order, as a BLAS does."""
-exact = njit(**_COMMON, **_INNER, **_EXACT)
+exact = _compiler(**_INNER, **_EXACT)
 """Called by kernels; computes as it is written, up to fused multiply-adds."""
