@@ -12,7 +12,7 @@ from sb3_policyflow.common.tree import are_small, rows, tensors
 from sb3_policyflow.resilience.collection import PendingBonus
 
 SHUFFLED_AT_ONCE = 2**26
-"""Bytes of a rollout up to which a shuffled copy of it is made for each epoch, if its rows are small."""
+"""Bytes of a rollout of small rows up to which a shuffled copy of it is made for each epoch."""
 
 
 class FlowRolloutBufferSamples(NamedTuple):

@@ -23,9 +23,14 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.foreign import check_overridden_methods
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names, own_options
+<<<<<<< HEAD
 from sb3_policyflow.flows import INITIALIZATIONS, FourierTimeEmbedding, VelocityField
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
+=======
+from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
+from sb3_policyflow.kernels import KernelCritic, make_velocity_field
+>>>>>>> wt-G
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -188,9 +193,8 @@ class FlowPolicy(ActorCriticPolicy):
         del self.action_net, self.action_dist, self.log_std
         self._build_actor()
         self._kernel_critic = KernelCritic()
-        embeddings = [part for part in self.modules() if isinstance(part, FourierTimeEmbedding)]
-        fixed = {id(embedding.frequencies) for embedding in embeddings}
-        learned = [parameter for parameter in self.parameters() if id(parameter) not in fixed]
+        fixed = "velocity.time_embedding.frequencies"  # of the velocity, and of a copy of it
+        learned = (p for name, p in self.named_parameters() if not name.endswith(fixed))
         self.optimizer = make_optimizer(
             self.optimizer_class, learned, lr_schedule(1), self.optimizer_kwargs
         )
@@ -217,7 +221,7 @@ class FlowPolicy(ActorCriticPolicy):
         :raises TypeError: If an ``mlp_extractor`` of one's own does not tell.
         """
         extractor = self.mlp_extractor
-        if not isinstance(getattr(extractor, "value_net", None), nn.Module):
+        if not hasattr(extractor, "value_net"):
             raise TypeError(
                 f"To train the critic alone, its part of {type(extractor).__name__} must be a "
                 "module named value_net, as in SB3's MlpExtractor."

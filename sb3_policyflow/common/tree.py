@@ -74,5 +74,14 @@ def in_chunks(function: Callable[[T], th.Tensor], tree: T, batch_size: int) -> t
     n_rows = len(next(tensors(tree)))
     size = CHUNK if are_small(tree) else min(batch_size, CHUNK)
     with th.no_grad():
-        starts = range(0, n_rows, size)
-        return th.cat([function(rows(tree, slice(start, start + size))) for start in starts])
+        first = function(rows(tree, slice(0, size)))
+        if size >= n_rows:
+            return first
+        # One tensor: many small ones would lie between what a chunk takes and gives back, and keep
+        # its memory from being used again.
+        results = first.new_empty(n_rows, *first.shape[1:])
+        results[:size] = first
+        for start in range(size, n_rows, size):
+            part = slice(start, start + size)
+            results[part] = function(rows(tree, part))
+        return results

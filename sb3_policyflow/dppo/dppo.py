@@ -23,6 +23,7 @@ from sb3_policyflow.dppo.policies import (
     DPPORecord,
     MlpFlowPolicy,
     MultiInputFlowPolicy,
+    warn_of_wide_bounds,
 )
 
 
@@ -128,6 +129,7 @@ class DPPO(FlowOnPolicyAlgorithm):
         "n_entropy_actions": checks.at_least(2),
         "n_entropy_states": checks.at_least(1),
     }
+    model_checks = (warn_of_wide_bounds,)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(

@@ -1,5 +1,6 @@
 """Policies of DPPO: an action is the end of a chain of Gaussian steps."""
 
+import warnings
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
@@ -39,6 +40,47 @@ class DPPORecord(NamedTuple):
 
     points: th.Tensor
     means: th.Tensor
+
+
+SHORTEST_MEANINGLESS = 200.0
+"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
+others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
+ADVICE = (
+    "use process='flow', which does not scale, or give the environment bounds that mean something "
+    "(gymnasium.wrappers.TransformAction)"
+)
+
+
+def _check_bounds(action_space: spaces.Space[Any]) -> None:
+    """Refuse bounds so wide that "ddpm" cannot scale actions to them."""
+    assert isinstance(action_space, spaces.Box)
+    with np.errstate(over="ignore"):
+        widths = action_space.high - action_space.low
+    if not np.isfinite(widths).all():
+        raise ValueError(
+            "process='ddpm' scales actions to their bounds, but those from "
+            f"{action_space.low.min():g} to {action_space.high.max():g} are further apart than a "
+            f"{widths.dtype} can tell: {ADVICE}."
+        )
+
+
+def warn_of_wide_bounds(model: Any) -> None:
+    """Warn where bounds seem to mean nothing, to which "ddpm" scales actions nevertheless.
+
+    An untrained policy has a standard deviation of about a fifth of their distance, and what it
+    explores in the end, ``min_sampling_std``, is in proportion.
+
+    :param model: A model, which is new if it has not seen a timestep.
+    """
+    box, policy = model.action_space, model.policy
+    width = (box.high - box.low).max()
+    if policy.process == "ddpm" and width >= SHORTEST_MEANINGLESS and model.num_timesteps == 0:
+        warnings.warn(
+            f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
+            f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "
+            f"stand for none, {ADVICE}.",
+            stacklevel=2,
+        )
 
 
 class DPPOPolicy(FlowPolicy):
@@ -115,6 +157,7 @@ class DPPOPolicy(FlowPolicy):
             )
         self.chain: DenoisingProcess
         if self.process == "ddpm":
+            _check_bounds(self.action_space)
             self.chain = DDPM(self.n_denoising_steps, self.denoised_clip, self.identity_skip)
         else:
             self.chain = EulerChain(self.n_denoising_steps)

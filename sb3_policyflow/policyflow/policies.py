@@ -152,7 +152,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         if self.gaussian:
             latents = features.new_zeros(len(features), self.action_dim)
         else:
-            latents = self.latent_std * self.draw_latents(features, deterministic)
+            latents = self.draw_latents(features, deterministic)
+            if self.latent_std != 1.0:
+                latents = self.latent_std * latents
         endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:

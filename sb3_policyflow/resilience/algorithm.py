@@ -1,10 +1,11 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
+import functools
 import io
 import pathlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import numpy as np
 import torch as th
@@ -28,6 +29,22 @@ from sb3_policyflow.resilience.saving import RandomStates, ResumeState
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
+    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
+
+    @functools.wraps(load)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        cls, *file = args
+        present = cls.former_names.get("path") if file and "path" in kwargs else None  # type: ignore[attr-defined]  # a class
+        if present is not None:
+            kwargs[present] = kwargs.pop("path")
+        return load(*args, **kwargs)
+
+    return wrapped
 
 
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
@@ -48,6 +65,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     observation, as in SB3, of the "current" one before it, or "none"."""
     allow_nan_observations: bool = False
     """Whether observations may have numbers that are not finite."""
+
+    former_names: ClassVar[Mapping[str, str]] = {}
+    """Present names of attributes by former ones, by which files and ``load`` may know them."""
 
     _callback: BaseCallback | None = None
     """The callback of the rollout that is being collected; its ``locals`` are the loop's."""
@@ -174,6 +194,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         ]
 
     @classmethod
+    @_takes_former_path
     def load(
         cls: type[SelfResilient],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -192,7 +213,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         when the model was saved, so that training continues as it would have. Environments are
         seeded with the model's seed and reset, as in SB3, unless ``force_reset`` is False.
 
-        :param path: The file, or one opened for reading.
+        :param path: The file, or one opened for reading. An attribute among ``kwargs`` may have
+            this name too, if it is a former one and the file is given by position.
         :param env: The environment in which to continue.
         :param device: Where to put the model.
         :param custom_objects: Attributes to take instead of the saved ones.
