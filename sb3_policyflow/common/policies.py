@@ -23,14 +23,9 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.foreign import check_overridden_methods
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names, own_options
-<<<<<<< HEAD
-from sb3_policyflow.flows import INITIALIZATIONS, FourierTimeEmbedding, VelocityField
+from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
-=======
-from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
-from sb3_policyflow.kernels import KernelCritic, make_velocity_field
->>>>>>> wt-G
 
 NetArch = list[int] | dict[str, list[int]]
 
