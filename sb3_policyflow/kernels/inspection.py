@@ -137,12 +137,13 @@ class _Reading(Generic[P]):
         if module is not self.module or not self.inspector.is_current():
             return False
         # Setting parameter.data can change all of a tensor and leave it the same object.
-        parts = self.parts
-        return (
-            are_usable(parts.tensors)
-            and [tensor.data_ptr() for tensor in parts.tensors] == parts.places
-            and [tensor.shape for tensor in parts.tensors] == parts.shapes
-        )
+        tensors = self.parts.tensors
+        if [tensor.data_ptr() for tensor in tensors] != self.parts.places:
+            return False
+        for tensor in tensors:
+            if tensor.dtype is not th.float32 or not tensor.is_contiguous():
+                return False
+        return [tensor.shape for tensor in tensors] == self.parts.shapes
 
 
 class KernelView(Generic[P]):
@@ -191,7 +192,10 @@ def why_torch_must_work() -> str | None:
         return "torch.func or autocast is at work"
     if any(GLOBAL_HOOKS):
         return "there are hooks for all modules"
-    if th._C._len_torch_dispatch_stack() > 0 or _has_function_mode():
+    modes = [th._C._get_function_stack_at(i) for i in range(th._C._len_torch_function_stack())]
+    # That of the default device does nothing to tensors that have one.
+    is_watched = modes and any(type(mode) is not DeviceContext for mode in modes)
+    if is_watched or th._C._len_torch_dispatch_stack() > 0:
         return "a mode takes part in torch's functions"
     return None
 
@@ -200,12 +204,6 @@ def has_values() -> bool:
     """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
     is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
     return not is_traced and th._C._functorch.peek_interpreter_stack() is None
-
-
-def _has_function_mode() -> bool:
-    """Whether there is a mode for torch's functions other than that of the default device."""
-    modes = range(th._C._len_torch_function_stack())
-    return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:

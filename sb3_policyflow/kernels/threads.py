@@ -34,7 +34,13 @@ def in_parts(n_rows: int, parts: int, run: Callable[[int, int, int], None]) -> N
     :param run: Works on some of the rows, for the most part without Python's global lock.
     """
     bounds = [n_rows * part // parts for part in range(parts + 1)]
-    others = [_pool().submit(run, part, *bounds[part : part + 2]) for part in range(1, parts)]
+    others = []
+    for part in range(1, parts):
+        try:
+            others.append(_pool().submit(run, part, *bounds[part : part + 2]))
+        except RuntimeError:  # noqa: PERF203
+            # Python starts no thread behind the end of its main thread, which others may outlive.
+            run(part, *bounds[part : part + 2])
     run(0, *bounds[:2])
     for other in others:
         other.result()

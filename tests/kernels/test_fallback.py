@@ -162,7 +162,7 @@ def test_without_numba_everything_works_and_is_the_same(setup: str) -> None:
 
 
 @pytest.mark.slow
-def test_kernels_are_kept_for_the_next_process_unless_outdated(tmp_path: Path) -> None:
+def test_kernels_are_kept_for_the_next_process(tmp_path: Path) -> None:
     def compiled() -> dict[Path, int]:
         train_in_a_process(NUMBA_CACHE_DIR=str(tmp_path))
         return {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb?")}
@@ -170,11 +170,6 @@ def test_kernels_are_kept_for_the_next_process_unless_outdated(tmp_path: Path) -
     first = compiled()
     assert len({path.name.split(".")[1].split("-")[0] for path in first}) >= 6
     assert compiled() == first
-    for path in first:
-        os.utime(path, (0, 0))
-    again = compiled()
-    assert again.keys() == first.keys()
-    assert min(again.values()) > 0
 
 
 @pytest.mark.parametrize("algorithm", [PolicyFlow, FPO, DPPO])
