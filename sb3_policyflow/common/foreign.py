@@ -74,10 +74,8 @@ def unknown_argument(
         return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
     similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
     places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
-    advice = (
-        f"Did you mean {_either(places)}?" if places else f"See help({owner}) for those it has."
-    )
-    return TypeError(f"{owner} has no argument {name!r}. {advice}")
+    meant = f"did you mean {_either(places)}?" if places else f"help({owner}) shows those it has."
+    return TypeError(f"{owner} has no argument {name!r}: {meant}")
 
 
 def _either(names: Iterable[str]) -> str:

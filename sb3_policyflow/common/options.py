@@ -186,7 +186,7 @@ def _policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
     for cls in policy_class.__mro__:
         if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
             found |= _named(inspect.signature(vars(cls)["__init__"]))
-    for name in ("self", "observation_space", "action_space", "lr_schedule"):
+    for name in ("self", "observation_space", "action_space", "lr_schedule", "use_sde"):
         found.pop(name, None)
     return found
 

@@ -172,8 +172,7 @@ class FlowPolicy(ActorCriticPolicy):
     def _build_mlp_extractor(self) -> None:
         """Build the critic's hidden layers; the actor's belong to the velocity field.
 
-        Networks of one's own, built here as SB3 documents, have their part: the velocity is
-        conditioned on what ``forward_actor`` makes of the features.
+        If a subclass builds others, the velocity gets what their ``forward_actor`` returns.
         """
         self.mlp_extractor = MlpExtractor(
             self.features_dim,
@@ -211,26 +210,23 @@ class FlowPolicy(ActorCriticPolicy):
         )
 
     def critic_parameters(self) -> Iterator[nn.Parameter]:
-        """The parameters that serve the critic alone.
-
-        :raises TypeError: If an ``mlp_extractor`` of one's own does not tell.
-        """
-        extractor = self.mlp_extractor
-        if not hasattr(extractor, "value_net"):
-            raise TypeError(
-                f"To train the critic alone, its part of {type(extractor).__name__} must be a "
-                "module named value_net, as in SB3's MlpExtractor."
-            )
-        yield from extractor.value_net.parameters()
+        """The parameters that serve the critic alone."""
+        yield from self.mlp_extractor.value_net.parameters()
         yield from self.value_net.parameters()
         if not self.share_features_extractor:
             yield from self.vf_features_extractor.parameters()
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim)."""
-        # BasePolicy's extract_features serves one extractor, ActorCriticPolicy's always both.
-        features = super(ActorCriticPolicy, self).extract_features(obs, self.pi_features_extractor)
-        return self.mlp_extractor.forward_actor(features)
+        is_own = type(self).extract_features is not ActorCriticPolicy.extract_features
+        if self.share_features_extractor or is_own:
+            features = self.extract_features(obs)
+        else:
+            # BasePolicy's serves one extractor, ActorCriticPolicy's both.
+            extract = super(ActorCriticPolicy, self).extract_features
+            features = extract(obs, self.pi_features_extractor)
+        actor = features[0] if isinstance(features, tuple) else features
+        return self.mlp_extractor.forward_actor(actor)
 
     def actor_critic_features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Features for actor and critic, extracted once where they are shared."""

@@ -85,6 +85,20 @@ class DPPOUpdate(FlowUpdate):
         return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)
 
 
+def check_warmup(model: Any) -> None:
+    """Refuse to train a critic alone that cannot be told from the actor.
+
+    :raises TypeError: If the policy has networks of the user's own without a ``value_net``.
+    """
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
+        )
+
+
 class DPPO(FlowOnPolicyAlgorithm):
     """On-policy learning with diffusion policies.
 
@@ -129,7 +143,7 @@ class DPPO(FlowOnPolicyAlgorithm):
         "n_entropy_actions": checks.at_least(2),
         "n_entropy_states": checks.at_least(1),
     }
-    model_checks = (warn_of_wide_bounds,)
+    model_checks = (warn_of_wide_bounds, check_warmup)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(

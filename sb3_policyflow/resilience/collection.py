@@ -24,7 +24,8 @@ class StepChecks:
     """Refuses rewards and observations that cannot be learned from.
 
     :param env: The training environment.
-    :param allow_nan_observations: Whether observations may have numbers that are not finite.
+    :param allow_nan_observations: Whether observations may have numbers that are not finite, if
+        ``VecNormalize`` does not spread them over all environments.
     """
 
     def __init__(self, env: VecEnv, allow_nan_observations: bool = False) -> None:
@@ -70,12 +71,18 @@ class StepChecks:
                     f"has {space.shape}: change one of them, with the help of "
                     "stable_baselines3.common.env_checker.check_env."
                 )
-            if self._allow_nan:
+            if np.isfinite(values).all():
                 continue
-            if normalize is not None and not np.isfinite(values).all():
-                for original, numbers, _ in _named(kind, normalize.get_original_obs(), space):
-                    check_finite(numbers, f"The environment's {original}", timestep, ADVICE)
-            check_finite(values, what, timestep, ADVICE, indices)
+            # VecNormalize spreads one environment's number over all of them.
+            read = obs if normalize is None else normalize.get_original_obs()
+            originals = {other: numbers for other, numbers, _ in _named(kind, read, self._space)}
+            if self._allow_nan:
+                spread = np.where(np.isfinite(originals[name]), values, 0.0)
+                advice = "keep NaN out of VecNormalize, by its norm_obs or norm_obs_keys"
+                check_finite(spread, f"The normalized {name}", timestep, advice, indices)
+            else:
+                check_finite(originals[name], what, timestep, ADVICE, indices)
+                check_finite(values, what, timestep, ADVICE, indices)
 
 
 def _named(
