@@ -9,23 +9,12 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 
-from sb3_policyflow.common import checks
+from sb3_policyflow.common import checks, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.checks import Check
 from sb3_policyflow.common.losses import clipped_value_loss
-from sb3_policyflow.common.optimization import clip_gradients
-from sb3_policyflow.common.options import (
-    FORMER_NAMES,
-    SHARED_CHECKS,
-    PolicyOption,
-    check_algorithm,
-    note_changed_options,
-    own_options,
-    read_loaded_options,
-)
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics
+from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, clip_gradients
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
@@ -57,11 +46,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
-    former_names: ClassVar[Mapping[str, str]] = FORMER_NAMES
+    former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
     """Present names of options by former ones."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
-    option_checks: ClassVar[Mapping[str, Check]] = SHARED_CHECKS
+    option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
 
@@ -71,8 +60,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for option in own_options(cls.policy_base):
-            setattr(cls, option.name, PolicyOption(option.name))
+        for option in options.own_options(cls.policy_base):
+            if not hasattr(cls, option.name):
+                setattr(cls, option.name, options.PolicyOption(option.name))
 
     def __init__(
         self,
@@ -149,8 +139,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         )
 
     def _setup_model(self) -> None:
-        read_loaded_options(self)
-        check_algorithm(self)
+        options.read_loaded_options(self)
+        options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
         )
@@ -212,8 +202,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
-
-    # The update
 
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
@@ -308,7 +296,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
-        note_changed_options(self)
+        options.note_changed_options(self)
         super().save(path, exclude, include)
 
     def learn(

@@ -3,8 +3,7 @@
 import functools
 import inspect
 import math
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypedDict, cast
 
 import torch as th
@@ -13,12 +12,10 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.foreign import unknown_argument
+from sb3_policyflow.common.names import unknown_argument, with_present_names
 from sb3_policyflow.common.schedules import Coefficient, check_lr_adaptation, parse_schedule
 
 P = ParamSpec("P")
-FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
-"""Present values of options by option and former value."""
 
 
 class FlowOptions(TypedDict, total=False):
@@ -204,7 +201,19 @@ class PolicyOption:
         return self if model is None else getattr(model.policy, self._name)
 
     def __set__(self, model: Any, value: object) -> None:
-        model.policy.change_option(self._name, value)
+        policy, name = model.policy, self._name
+        if name in policy.fixed_options:
+            raise AttributeError(
+                f"{name} cannot change, because the policy was made with it: save the model and "
+                f"load it with load(file, {name}={value!r}), or make another one."
+            )
+        former = getattr(policy, name)
+        setattr(policy, name, value)
+        try:
+            checks.check_options(policy)
+        except ValueError:
+            setattr(policy, name, former)
+            raise
 
 
 def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
@@ -230,32 +239,6 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
         return extended
 
     return extend
-
-
-def with_present_names(
-    options: Mapping[str, Any], former_names: Mapping[str, str], warn: bool = True
-) -> dict[str, Any]:
-    """Options under their present names; where one has changed, a ``DeprecationWarning``.
-
-    >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
-    {'size': 2, 'rule_kwargs': {'factor': 3}}
-
-    :param options: Options by name, former or present.
-    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
-        become a key of another one.
-    :param warn: Whether to warn. Options that come from a file are nobody's mistake.
-    """
-    present = {name: value for name, value in options.items() if name not in former_names}
-    for former in former_names.keys() & options.keys():
-        name, _, key = former_names[former].partition(".")
-        present[name] = (
-            {**(present.get(name) or {}), key: options[former]} if key else options[former]
-        )
-        _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
-    for name, former in _former_values(present):
-        present[name] = FORMER_VALUES[name, former]
-        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
-    return present
 
 
 def note_changed_options(model: Any) -> None:
@@ -313,12 +296,3 @@ def check_algorithm(model: Any) -> None:
             "With desired_kl the learning rate follows the divergence of the policy: give the "
             "learning_rate that it starts with, not a schedule."
         )
-
-
-def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
-
-
-def _warn_if(warn: bool, change: str) -> None:
-    if warn:
-        warnings.warn(f"{change}: use the new name.", DeprecationWarning, stacklevel=4)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -20,9 +20,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.foreign import check_overridden_methods
-from sb3_policyflow.common.optimization import make_optimizer
+from sb3_policyflow.common.names import check_overridden_methods
 from sb3_policyflow.common.options import accepts_former_names, own_options
+from sb3_policyflow.common.update import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
@@ -138,27 +138,6 @@ class FlowPolicy(ActorCriticPolicy):
         own = [option.name for option in own_options(type(self)) if hasattr(self, option.name)]
         return {**data, **{name: getattr(self, name) for name in (*self.shared_options, *own)}}
 
-    def change_option(self, name: str, value: object) -> None:
-        """Change an own option of the policy, which has its effect at once.
-
-        :param name: The option.
-        :param value: Its value.
-        :raises AttributeError: If the networks were made with it.
-        :raises ValueError: If it cannot have this value.
-        """
-        if name in self.fixed_options:
-            raise AttributeError(
-                f"{name} cannot change, because the policy was made with it: save the model and "
-                f"load it with load(file, {name}={value!r}), or make another one."
-            )
-        former = getattr(self, name)
-        setattr(self, name, value)
-        try:
-            checks.check_options(self)
-        except ValueError:
-            setattr(self, name, former)
-            raise
-
     @property
     def action_dim(self) -> int:
         """Number of action dimensions, whatever the shape of the Box."""
@@ -236,12 +215,12 @@ class FlowPolicy(ActorCriticPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
-        modules: list[nn.Module | None] = [self]
+        modules: list[Any] = [self]
         for module in modules:  # grows; much faster than Module.modules()
-            if module is not None and module.training is not mode:
+            if module.training is not mode:
                 super().set_training_mode(mode)
                 return
-            modules += module._modules.values() if module is not None else ()
+            modules += [part for part in module._modules.values() if part is not None]
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
@@ -309,8 +288,7 @@ class FlowPolicy(ActorCriticPolicy):
             row = int((~actions.isfinite()).any(dim=-1).nonzero()[0])
             raise NotFiniteError(
                 f"The policy's action is not finite, for observation {row} of the batch: look for "
-                "numbers that are not finite in the observation and in the parameters. In "
-                "training, load an earlier checkpoint and lower the learning rate."
+                "such numbers in observation and parameters, or load an earlier checkpoint."
             )
         return actions.reshape(-1, *self.action_space.shape)
 
@@ -321,11 +299,7 @@ class FlowPolicy(ActorCriticPolicy):
         """Refuse: SB3's distributions say how likely actions are."""
         raise self._no_likelihood()
 
-    def evaluate_actions(
-        self,
-        obs: PyTorchObs,  # noqa: ARG002
-        actions: th.Tensor,  # noqa: ARG002
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> Any:  # noqa: ARG002
         """Refuse: the likelihood of an action under a flow policy has no closed form."""
         raise self._no_likelihood()
 
@@ -338,20 +312,6 @@ class FlowPolicy(ActorCriticPolicy):
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )
-
-
-def policy_aliases(
-    mlp: type[FlowPolicy], cnn: type[FlowPolicy], multi_input: type[FlowPolicy]
-) -> dict[str, type[BasePolicy]]:
-    """An algorithm's policies by the names of flow policies and by those of SB3."""
-    return {
-        "MlpFlowPolicy": mlp,
-        "CnnFlowPolicy": cnn,
-        "MultiInputFlowPolicy": multi_input,
-        "MlpPolicy": mlp,
-        "CnnPolicy": cnn,
-        "MultiInputPolicy": multi_input,
-    }
 
 
 FlowActorCriticPolicy = FlowPolicy

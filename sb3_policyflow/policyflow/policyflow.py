@@ -17,8 +17,8 @@ from sb3_policyflow.common.losses import (
     gaussian_kl,
     shifted_gaussian_log_ratio,
 )
+from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
-from sb3_policyflow.common.policies import policy_aliases
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms

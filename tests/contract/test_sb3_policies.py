@@ -192,9 +192,7 @@ def test_methods_that_nothing_calls_are_refused(algorithm: type[Any], name: str)
 
 
 @pytest.mark.parametrize("name", ["evaluate_actions", "get_distribution"])
-def test_methods_that_training_does_not_call_are_announced(
-    algorithm: type[Any], name: str
-) -> None:
+def test_methods_that_training_does_not_call_are_announced(algorithm: type[Any], name: str) -> None:
     with pytest.warns(UserWarning, match=f"Own overrides {name}, which the flow algorithms do not"):
         make(algorithm, own(algorithm, **{name: lambda *_: "mine"}))
 

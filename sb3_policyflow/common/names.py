@@ -1,9 +1,14 @@
-"""What users of SB3 give to its policies and a flow policy has not, and where to go instead."""
+"""Names of arguments and methods: former ones, SB3's that have no meaning here, misspelt ones."""
 
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+
+FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
+"""Present values of options by option and former value."""
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
@@ -86,3 +91,52 @@ def _either(names: Iterable[str]) -> str:
     """
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
+
+
+def with_present_names(
+    options: Mapping[str, Any], former_names: Mapping[str, str], warn: bool = True
+) -> dict[str, Any]:
+    """Options under their present names; where one has changed, a ``DeprecationWarning``.
+
+    >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
+    {'size': 2, 'rule_kwargs': {'factor': 3}}
+
+    :param options: Options by name, former or present.
+    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
+        become a key of another one.
+    :param warn: Whether to warn. Options that come from a file are nobody's mistake.
+    """
+    present = {name: value for name, value in options.items() if name not in former_names}
+    for former in former_names.keys() & options.keys():
+        name, _, key = former_names[former].partition(".")
+        present[name] = (
+            {**(present.get(name) or {}), key: options[former]} if key else options[former]
+        )
+        _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
+    for name, former in _former_values(present):
+        present[name] = FORMER_VALUES[name, former]
+        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
+    return present
+
+
+def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
+
+
+def _warn_if(warn: bool, change: str) -> None:
+    if warn:
+        warnings.warn(f"{change}: use the new name.", DeprecationWarning, stacklevel=4)
+
+
+def policy_aliases(
+    mlp: type[BasePolicy], cnn: type[BasePolicy], multi_input: type[BasePolicy]
+) -> dict[str, type[BasePolicy]]:
+    """An algorithm's policies by the names of flow policies and by those of SB3."""
+    return {
+        "MlpFlowPolicy": mlp,
+        "CnnFlowPolicy": cnn,
+        "MultiInputFlowPolicy": multi_input,
+        "MlpPolicy": mlp,
+        "CnnPolicy": cnn,
+        "MultiInputPolicy": multi_input,
+    }
