@@ -19,8 +19,8 @@ FOREIGN_ARGUMENTS = {
         "to their bounds, to which DPPO with process='ddpm' scales them."
     ),
     "log_std_init": (
-        "only PolicyFlow has Gaussian noise that is learned. That of FPO is action_noise_std, that "
-        "of DPPO min_sampling_std."
+        "only PolicyFlow has Gaussian noise that is learned; FPO and DPPO have options of their "
+        "own for the noise of their actions."
     ),
 }
 """Arguments of SB3's actor-critic policies that some or all flow policies do not have, and why."""

@@ -68,7 +68,7 @@ def warn_of_wide_bounds(model: Any) -> None:
     """Warn where bounds seem to mean nothing, to which "ddpm" scales actions nevertheless.
 
     An untrained policy has a standard deviation of about a fifth of their distance, and what it
-    explores in the end, ``min_sampling_std``, is in proportion.
+    explores in the end is in proportion to it, too.
 
     :param model: A model, which is new if it has not seen a timestep.
     """
