@@ -14,6 +14,9 @@ from sb3_policyflow.kernels.activations import PLAIN, WITH_ALPHA, Activation
 from sb3_policyflow.kernels.compiler import load_kernels, note_fallback
 from sb3_policyflow.kernels.layouts import Integers, Kernels
 
+TORCHS_OWN = (th.Tensor, nn.Parameter)
+"""Classes of tensors whose numbers are where they say, and who have no functions of their own."""
+
 
 class UnsupportedError(Exception):
     """The kernels cannot work on a module; the message says why, as a part of a sentence."""
@@ -176,6 +179,7 @@ class KernelView(Generic[P]):
             try:
                 parts = self._read(kernels, inspector, module)
             except UnsupportedError as unsupported:
+                self._reading = None  # which holds memory
                 note_fallback(str(unsupported))
                 return str(unsupported)
             reading = self._reading = _Reading(module, inspector, parts)
@@ -207,8 +211,10 @@ def has_values() -> bool:
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:
-    """Whether kernels can work on these tensors: contiguous float32 on the CPU."""
+    """Whether kernels can work on these tensors: torch's own, contiguous float32 on the CPU."""
     for tensor in tensors:
+        if type(tensor) not in TORCHS_OWN:
+            return False
         if tensor.dtype is not th.float32 or not tensor.is_cpu or not tensor.is_contiguous():
             return False
     return True
@@ -221,7 +227,7 @@ def require_usable(*tensors: th.Tensor) -> None:
         which may have no memory of its own.
     """
     for tensor in tensors:
-        if type(tensor) not in (th.Tensor, nn.Parameter):
+        if type(tensor) not in TORCHS_OWN:
             raise UnsupportedError(f"a {type(tensor).__name__} takes the place of a parameter")
         if not tensor.is_cpu:
             raise UnsupportedError(f"the policy is on {tensor.device.type}")

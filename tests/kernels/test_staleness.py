@@ -185,6 +185,20 @@ def test_a_hook_sees_and_changes_what_passes() -> None:
         assert th.equal(field.integrate(Z, S, **OPTIONS), before)
 
 
+def test_first_use_in_inference_mode() -> None:
+    field = make_field(2, 3, [8, 8])
+    with th.inference_mode():
+        field.integrate(Z, S, **OPTIONS)
+    with th.no_grad():
+        others = {**OPTIONS, "solver": "rk4"}
+        th.testing.assert_close(
+            field.integrate(Z, S, **others), integrate_plainly(field, Z, S, **others)
+        )
+    step(th.optim.SGD)(field)
+    with th.no_grad():
+        th.testing.assert_close(field.integrate(Z, S, **OPTIONS), reference(field))
+
+
 def test_copies_go_their_own_way() -> None:
     field = make_field(2, 3, [8, 8])
     with th.no_grad():

@@ -66,6 +66,7 @@ REGISTER = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore:Full backward hook")
 @pytest.mark.parametrize("register", REGISTER)
 def test_hooks_of_all_modules_see_every_module_of_a_field(register: Any) -> None:
     field = make_field(2, 3, [8, 8])
@@ -126,10 +127,19 @@ def test_operations_are_counted_as_without_kernels(
     assert found == count() > 0
 
 
-def test_a_parameter_of_another_class_is_torchs(algorithm: Any) -> None:
-    class Named(th.Tensor):
-        """A tensor that has its own way."""
+class Named(th.Tensor):
+    """A tensor of a class that may have its own functions."""
 
+
+def test_inputs_of_another_class_keep_it() -> None:
+    field = make_field(2, 3, [8, 8])
+    z, s = th.randn(4, 2), th.randn(4, 3).as_subclass(Named)
+    with th.no_grad():
+        assert isinstance(field(z, th.rand(4), s), Named)
+        assert isinstance(field.integrate(z, s, solver="euler", n_steps=2), Named)
+
+
+def test_a_parameter_of_another_class_is_torchs(algorithm: Any) -> None:
     model = algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY, device="cpu", **SMALL)
     output = model.policy.velocity.output
     output._parameters["weight"] = output.weight.detach().as_subclass(Named)
