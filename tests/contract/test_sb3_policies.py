@@ -1,4 +1,4 @@
-"""All that SB3 lets its users give to, override in and read from a policy has an effect or a reason.
+"""What SB3 lets its users give to, override in and read from a policy has an effect or a reason.
 
 The tables are complete: a name that SB3 adds makes a test fail until it is decided on.
 """
@@ -192,9 +192,7 @@ def test_methods_that_nothing_calls_are_refused(algorithm: type[Any], name: str)
 
 
 @pytest.mark.parametrize("name", ["evaluate_actions", "get_distribution"])
-def test_methods_that_training_does_not_call_are_announced(
-    algorithm: type[Any], name: str
-) -> None:
+def test_methods_that_training_does_not_call_are_announced(algorithm: type[Any], name: str) -> None:
     with pytest.warns(UserWarning, match=f"Own overrides {name}, which the flow algorithms do not"):
         make(algorithm, own(algorithm, **{name: lambda *_: "mine"}))
 
@@ -378,7 +376,7 @@ def test_buffers_of_sb3_are_refused_with_a_sentence(algorithm: type[Any]) -> Non
         (
             PolicyFlow,
             {"policy_kwargs": {"brownian_coef": 0.1}},
-            r"not of its policy: take it out of policy_kwargs, as PolicyFlow\(\.\.\., brownian_coef",
+            r"not of its policy: take it out of policy_kwargs, as PolicyFlow\(\.\.\., brown",
         ),
     ],
     ids=str,
