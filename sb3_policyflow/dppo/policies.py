@@ -73,8 +73,10 @@ def warn_of_wide_bounds(model: Any) -> None:
     :param model: A model, which is new if it has not seen a timestep.
     """
     box, policy = model.action_space, model.policy
+    if policy.process != "ddpm" or model.num_timesteps > 0:
+        return
     width = (box.high - box.low).max()
-    if policy.process == "ddpm" and width >= SHORTEST_MEANINGLESS and model.num_timesteps == 0:
+    if width >= SHORTEST_MEANINGLESS:
         warnings.warn(
             f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
             f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "

@@ -1,4 +1,4 @@
-"""All that SB3 lets its users give to, override in and read from a policy has an effect or a reason.
+"""What SB3 lets its users give to, override in and read from a policy has an effect or a reason.
 
 The tables are complete: a name that SB3 adds makes a test fail until it is decided on.
 """
@@ -376,7 +376,7 @@ def test_buffers_of_sb3_are_refused_with_a_sentence(algorithm: type[Any]) -> Non
         (
             PolicyFlow,
             {"policy_kwargs": {"brownian_coef": 0.1}},
-            r"not of its policy: take it out of policy_kwargs, as PolicyFlow\(\.\.\., brownian_coef",
+            r"not of its policy: take it out of policy_kwargs, as PolicyFlow\(\.\.\., brown",
         ),
     ],
     ids=str,

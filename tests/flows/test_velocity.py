@@ -7,6 +7,7 @@ from torch import nn
 
 from sb3_policyflow.flows import SOLVERS, FourierTimeEmbedding, VelocityField, integrate
 from sb3_policyflow.flows.folding import is_foldable
+from tests.helpers import learned
 
 
 def test_time_embedding_sees_cosines_and_sines_of_its_frequencies() -> None:
@@ -20,7 +21,9 @@ def test_time_embedding_sees_cosines_and_sines_of_its_frequencies() -> None:
 def test_frequencies_are_fixed_but_saved() -> None:
     embedding = FourierTimeEmbedding(8, frequencies=3, frequency_scale=16.0)
     assert "frequencies" in embedding.state_dict()
-    assert "frequencies" not in dict(embedding.named_parameters())
+    embedding.requires_grad_(True)
+    embedding(th.rand(5)).sum().backward()
+    assert embedding.frequencies.grad is None
     assert embedding.frequencies.shape == (3,)
     assert len(FourierTimeEmbedding(8).frequencies) == 4  # the paper's d / 2
 
@@ -55,7 +58,7 @@ def test_initializations() -> None:
     assert fields["glorot"](x, t, s).abs().min() > 0
     assert th.equal(fields["glorot_zero_output"](x, t, s), th.zeros(7, 2))
     assert fields["glorot_zero_output"].hidden[0].weight.abs().sum() > 0  # type: ignore[operator, union-attr]
-    assert all(not parameter.any() for parameter in fields["zero"].parameters())
+    assert all(not parameter.any() for parameter in learned(fields["zero"]))
     wide = VelocityField(200, 3, net_arch=[300], initialization="glorot", embedding_dim=100)
     weight = wide.hidden[0].weight
     assert isinstance(weight, th.Tensor)
@@ -88,7 +91,7 @@ def test_splitting_the_first_layer_changes_no_flow_and_no_gradient(
         field.integrate(z, s, solver=solver, **OPTIONS),
         integrate(lambda x, t: field(x, t, s), z, solver=solver, **OPTIONS),
     ):
-        grads = th.autograd.grad(endpoints.square().sum(), [z, s, *field.parameters()])
+        grads = th.autograd.grad(endpoints.square().sum(), [z, s, *learned(field)])
         found.append([endpoints, *grads])
     assert is_foldable(field)
     th.testing.assert_close(*found)

@@ -11,6 +11,7 @@ from torch import nn
 from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.kernels.activations import Activation
 from sb3_policyflow.kernels.inspection import ModuleInspector
+from tests.helpers import learned
 from tests.kernels.plain import (
     ACTIVATIONS,
     SHAPES,
@@ -118,7 +119,7 @@ def gradients(field: nn.Module, inputs: list[th.Tensor], weights: th.Tensor) -> 
         for tensor, needs in zip(inputs, (True, False, True), strict=True)
     )
     velocity = field(points, times, features)
-    leaves = [*field.parameters(), points, features]
+    leaves = [*learned(field), points, features]
     return [velocity, *th.autograd.grad((velocity * weights).sum(), leaves)]
 
 
