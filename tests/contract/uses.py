@@ -130,6 +130,19 @@ def make(algorithm: type[Any], env: Any = None, policy: Any = "MlpPolicy", **opt
     return algorithm(policy, steps() if env is None else env, policy_kwargs=policy_kwargs, **chosen)
 
 
+def learned(algorithm: type[Any], **options: Any) -> Any:
+    """A model whose weights are far from where they began."""
+    return make(algorithm, **{"learning_rate": 1e-2, **options}).learn(64)
+
+
+def output_layer(model: Any) -> th.nn.Linear:
+    """The layer whose bias moves the deterministic action."""
+    policy = model.policy
+    layer: th.nn.Linear
+    layer = policy.action_net if isinstance(model, PPO) else policy.velocity.output
+    return layer
+
+
 class Each(BaseCallback):
     """Calls a function with itself in every step."""
 
