@@ -196,10 +196,7 @@ def why_torch_must_work() -> str | None:
         return "torch.func or autocast is at work"
     if any(GLOBAL_HOOKS):
         return "there are hooks for all modules"
-    modes = [th._C._get_function_stack_at(i) for i in range(th._C._len_torch_function_stack())]
-    # That of the default device does nothing to tensors that have one.
-    is_watched = modes and any(type(mode) is not DeviceContext for mode in modes)
-    if is_watched or th._C._len_torch_dispatch_stack() > 0:
+    if th._C._len_torch_dispatch_stack() or (th._C._len_torch_function_stack() and _is_watched()):
         return "a mode takes part in torch's functions"
     return None
 
@@ -208,6 +205,12 @@ def has_values() -> bool:
     """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
     is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
     return not is_traced and th._C._functorch.peek_interpreter_stack() is None
+
+
+def _is_watched() -> bool:
+    """Whether torch's functions have a mode; that of the default device changes no tensor."""
+    modes = range(th._C._len_torch_function_stack())
+    return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:
