@@ -1,4 +1,4 @@
-"""Wrappers around single environments, unusual spaces, and options of policies from users' files."""
+"""Wrappers around single environments, unusual spaces, and options of policies in use."""
 
 from collections.abc import Callable
 from typing import Any
@@ -61,7 +61,7 @@ WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "NormalizeReward": wrappers.NormalizeReward,
     "FrameStack": lambda env: wrappers.FrameStackObservation(env, 3),
     "Flatten": wrappers.FlattenObservation,
-    "TimeAware": wrappers.TimeAwareObservation,
+    "TimeAware": lambda env: wrappers.TimeAwareObservation(wrappers.TimeLimit(env, 4)),
     "float16": lambda env: wrappers.DtypeObservation(env, np.float16),
     "Sticky": lambda env: wrappers.StickyAction(env, 0.3),
     "MaxAndSkip": lambda env: wrappers.MaxAndSkipObservation(env, 2),
@@ -180,22 +180,30 @@ def test_shapes_of_actions(any_algorithm: type[Any], action_space: Any) -> None:
     assert action.shape == action_space.shape
 
 
-def test_empty_observations(any_algorithm: type[Any]) -> None:
+def test_empty_observations_are_refused(any_algorithm: type[Any]) -> None:
+    """By SB3's extractor."""
     space = spaces.Box(-1, 1, (0,))
     env = Returning(lambda: np.zeros(0, np.float32), observation_space=space)
-    train(make(any_algorithm, env))
+    with pytest.raises(AssertionError):
+        make(any_algorithm, env)
 
 
 @pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
 def test_bounds_that_stand_for_none(any_algorithm: type[Any], bound: float) -> None:
     """Actions stay small enough to be used; a policy that scales them to the bounds warns."""
-    space = spaces.Box(-bound, bound, (2,))
-    if any_algorithm is DPPO:
-        with pytest.warns(UserWarning, match="bounds"):
-            make(any_algorithm, Returning(lambda: OBSERVED, action_space=space))
-        return
-    model = train(make(any_algorithm, Returning(lambda: OBSERVED, action_space=space)))
+    env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
+    model = train(
+        make(any_algorithm, env, **({"process": "flow"} if any_algorithm is DPPO else {}))
+    )
     assert np.abs(model.predict(np.tile(OBSERVED, (100, 1)))[0]).max() < 20
+
+
+@pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
+def test_dppo_warns_of_bounds_that_mean_nothing(bound: float) -> None:
+    """It scales its actions to them."""
+    env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
+    with pytest.warns(UserWarning, match="bounds"):
+        make(DPPO, env)
 
 
 class Filled(FlattenExtractor):
