@@ -190,7 +190,7 @@ def test_empty_observations_are_refused(any_algorithm: type[Any]) -> None:
 
 @pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
 def test_bounds_that_stand_for_none(any_algorithm: type[Any], bound: float) -> None:
-    """Actions stay small enough to be used; a policy that scales them to the bounds warns."""
+    """Actions stay small enough to be used."""
     env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
     model = train(
         make(any_algorithm, env, **({"process": "flow"} if any_algorithm is DPPO else {}))
