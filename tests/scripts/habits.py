@@ -7,16 +7,16 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 KINDS = [np.float16, np.float32, np.float64, np.int64]
-WRAPPERS: dict[str, Any] = {"VecNormalize": VecNormalize, "VecMonitor": VecMonitor}
 habits: st.SearchStrategy[dict[str, Any]] = st.fixed_dictionaries(
     {
         "overrides": st.sampled_from([None, "step", "step_async", "step_wait"]),
-        "wrappers": st.lists(st.sampled_from(sorted(WRAPPERS)), max_size=2, unique=True),
+        "wrappers": st.lists(st.sampled_from(["normalize", "monitor"]), max_size=2, unique=True),
         "rewards": st.sampled_from(KINDS),
         "dones": st.sampled_from([np.bool_, np.uint8, np.float32]),
         "infos": st.sampled_from([list, tuple]),
@@ -74,8 +74,10 @@ def counting(overrides: str) -> type[VecEnvWrapper]:
 
 def wrap(env: VecEnv, drawn: dict[str, Any]) -> VecEnv:
     """An environment in the wrappers that were drawn; the one that counts is the outermost."""
+    space = env.observation_space
+    is_numbers = isinstance(space, spaces.Box) and space.dtype != np.uint8
     for name in drawn["wrappers"]:
-        env = WRAPPERS[name](env)
+        env = VecMonitor(env) if name == "monitor" else VecNormalize(env, norm_obs=is_numbers)
     env = Cast(env, drawn)
     return counting(drawn["overrides"])(env) if drawn["overrides"] else env
 
@@ -101,10 +103,13 @@ class Watch(BaseCallback):
     def _on_rollout_end(self) -> None:
         changes, self.changes = self.changes, {}
         for name, value in changes.items():
-            try:
-                setattr(self.model, name, value)
-            except (ValueError, AttributeError) as refusal:
-                self.refusals.append(refusal)
+            self._change(name, value)
+
+    def _change(self, name: str, value: Any) -> None:
+        try:
+            setattr(self.model, name, value)
+        except (ValueError, AttributeError) as refusal:
+            self.refusals.append(refusal)
 
     def check(self) -> None:
         """Whether all of it is as it was, and the environment's wrappers were used.
