@@ -9,7 +9,8 @@ SCRIPT = Path(__file__).parent / "scripts" / "fuzz.py"
 
 
 @pytest.mark.slow
-def test_every_draw_trains_or_is_refused_by_a_sentence() -> None:
+def test_every_draw_trains_or_is_refused_by_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(SCRIPT.parent)
     spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
     assert spec is not None
     assert spec.loader is not None

@@ -117,7 +117,7 @@ def test_wrappers_around_workers(any_algorithm: type[Any], wrapper: Any, start_m
     kwargs = {"start_method": start_method}
     env = make_vec_env(Steps, 2, vec_env_cls=SubprocVecEnv, vec_env_kwargs=kwargs)
     try:
-        with within(30):
+        with within(15):
             model = make(any_algorithm, wrapper(env)).learn(32)
         assert model.env.n_steps == 16
     finally:

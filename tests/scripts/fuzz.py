@@ -1,6 +1,10 @@
-"""Draws spaces and hyperparameters: each draw trains two iterations, or is refused by a sentence.
+"""Draws spaces, hyperparameters and habits: each draw trains, or is refused by a sentence.
 
 python tests/scripts/fuzz.py [DRAWS] [SEED]
+
+A draw is two iterations in wrappers, with attributes that are changed between them and, now and
+then, with another thread that asks for actions: see ``habits.py``. Nothing that a callback has seen
+may change later, and wrappers are called as often as steps were taken.
 
 Prints how many draws were trained and how many refused; fails with the first draw that was neither.
 """
@@ -14,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from habits import Watch, asked, habits, wrap
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -195,11 +200,11 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
     algorithm = draw(st.sampled_from([PolicyFlow, FPO, DPPO]))
     n_steps, n_envs = draw(st.integers(2, 5)), draw(st.integers(1, 3))
     options = draw(st.fixed_dictionaries({}, optional={**common, **own[algorithm]}))
-    if "gaussian" in options or "stochastic" in options.get("path", ""):
+    if "gaussian" in options or "stochastic" in options.get("interpolant", ""):
         for name in ("brownian_coef", "uniform_noise_coef"):
             options.pop(name, None)
     options["policy_kwargs"] = draw(networks)
-    if algorithm is PolicyFlow and not ("gaussian" in options or "path" in options):
+    if algorithm is PolicyFlow and not ("gaussian" in options or "interpolant" in options):
         options["policy_kwargs"]["latent_std"] = draw(st.sampled_from([0.1, 1.0, 3.0]))
     options["n_steps"], options["n_epochs"] = n_steps, draw(st.integers(1, 2))
     options["batch_size"] = draw(st.integers(2, n_steps * n_envs))
@@ -208,6 +213,8 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
         "observation_space": draw(observations),
         "action_space": draw(boxes),
         "reward_scale": draw(st.sampled_from([0.0, 1.0, 1e6])),
+        "habits": draw(habits),
+        "changes": draw(changes_of(algorithm)),
     }
     spoiler = draw(st.sampled_from([None] * 6 + ["option", "actions"]))
     if spoiler == "option":
@@ -217,6 +224,13 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any], dict[str, Any]]:
     if spoiler == "actions":
         environment["action_space"] = draw(unbounded_boxes | st.just(spaces.Discrete(3)))
     return algorithm, options, environment
+
+
+def changes_of(algorithm: type[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    """At most two attributes, and what they are set to between the iterations."""
+    known = {**common, **own[algorithm]}
+    names = st.lists(st.sampled_from(sorted(known)), max_size=2, unique=True)
+    return names.flatmap(lambda drawn: st.fixed_dictionaries({n: known[n] for n in drawn}))
 
 
 def policy_name(space: spaces.Space[Any]) -> str:
@@ -229,15 +243,20 @@ def policy_name(space: spaces.Space[Any]) -> str:
 def run(algorithm: type[Any], options: dict[str, Any], environment: dict[str, Any]) -> str:
     """Train two iterations. Returns "trained", or the sentence of the refusal."""
     n_envs = environment["n_envs"]
-    parts = {key: value for key, value in environment.items() if key != "n_envs"}
-    envs = DummyVecEnv([lambda: Anything(**parts) for _ in range(n_envs)])
+    drawn, watch = environment["habits"], Watch(environment["changes"])
+    parts = {k: environment[k] for k in ("observation_space", "action_space", "reward_scale")}
+    envs = wrap(DummyVecEnv([lambda: Anything(**parts) for _ in range(n_envs)]), drawn)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             model = algorithm(policy_name(parts["observation_space"]), envs, seed=0, **options)
-            model.learn(2 * n_envs * max(options["n_steps"], 1))
+            with asked(model, parts["observation_space"].sample(), drawn["asks"]):
+                model.learn(2 * n_envs * max(options["n_steps"], 1), watch)
         except (ValueError, AssertionError, FloatingPointError) as refusal:
             return _sentence(refusal)
+    watch.check()
+    for refusal in watch.refusals:
+        _sentence(refusal)
     for name, parameter in model.policy.named_parameters():
         assert th.isfinite(parameter).all(), f"{name} is not finite"
     action, _ = model.predict(parts["observation_space"].sample())
