@@ -48,6 +48,14 @@ def train(model: Any, total_timesteps: int, **options: Any) -> Any:
     return model
 
 
+def learned(module: nn.Module) -> list[nn.Parameter]:
+    """The parameters of a module that are learned: all but the frequencies of time embeddings.
+
+    :param module: A policy or a part of it.
+    """
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
+
+
 def perturb(module: nn.Module, scale: float) -> None:
     """Add noise to all parameters, as an update might.
 
@@ -55,7 +63,7 @@ def perturb(module: nn.Module, scale: float) -> None:
     :param scale: Standard deviation of the noise.
     """
     with th.no_grad():
-        for parameter in module.parameters():
+        for parameter in learned(module):
             parameter += scale * th.randn_like(parameter)
 
 

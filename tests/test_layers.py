@@ -8,7 +8,7 @@ import pytest
 import sb3_policyflow
 
 ROOT = Path(sb3_policyflow.__file__).parent
-ALGORITHMS = {"policyflow", "fpo", "dppo"}
+ALGORITHMS = ("policyflow", "fpo", "dppo")
 BELOW: dict[str, set[str]] = {
     "envs": set(),
     "flows": set(),

@@ -6,24 +6,15 @@ from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 
-from sb3_policyflow.common import checks
+from sb3_policyflow.common import checks, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.checks import Check
 from sb3_policyflow.common.losses import clipped_value_loss
-from sb3_policyflow.common.optimization import clip_gradients
-from sb3_policyflow.common.options import (
-    FORMER_NAMES,
-    SHARED_CHECKS,
-    check_algorithm,
-    read_loaded_options,
-)
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics
+from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, clip_gradients
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
@@ -46,6 +37,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         over the whole "rollout".
     :param timeout_bootstrap: The value with which an episode cut by a time limit continues: that of
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
+    :param allow_nan_observations: Whether the features extractor can handle observations that are
+        not finite, such as NaN for a missing reading. By default they stop the training.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -53,17 +46,23 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
-    former_names: ClassVar[Mapping[str, str]] = FORMER_NAMES
+    former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
     """Present names of options by former ones."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
-    option_checks: ClassVar[Mapping[str, Check]] = SHARED_CHECKS
+    option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
 
     trust_region: str = "ppo"
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for option in options.own_options(cls.policy_base):
+            if not hasattr(cls, option.name):
+                setattr(cls, option.name, options.PolicyOption(option.name))
 
     def __init__(
         self,
@@ -98,6 +97,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         lr_adaptation_kwargs: dict[str, Any] | None = None,
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
+        allow_nan_observations: bool = False,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -110,6 +110,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.lr_adaptation_kwargs = lr_adaptation_kwargs
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
+        self.allow_nan_observations = allow_nan_observations
         self.policy_options = policy_options
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
@@ -138,8 +139,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         )
 
     def _setup_model(self) -> None:
-        read_loaded_options(self)
-        check_algorithm(self)
+        options.read_loaded_options(self)
+        options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
         )
@@ -150,13 +151,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        start = self.lr_schedule(1.0)
-        if self.desired_kl is None:
-            self.adaptive_learning_rate = None
-        elif self.adaptive_learning_rate is None or self._adaptive_start != start:
-            # Otherwise a saved run continues that began with this learning rate.
-            self.adaptive_learning_rate = start
-        self._adaptive_start = start
+        self._start_adaptive_learning_rate()
         for check in self.model_checks:
             check(self)
 
@@ -177,9 +172,19 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         # linear schedule with it: a negative learning rate would ascend the loss.
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
 
+    def _start_adaptive_learning_rate(self) -> None:
+        """Start with ``learning_rate``, unless a run continues that started with it."""
+        start = self.lr_schedule(1.0)
+        if self.desired_kl is None:
+            self.adaptive_learning_rate = None
+        elif self.adaptive_learning_rate is None or start != self._adaptive_start:
+            self.adaptive_learning_rate = start
+        self._adaptive_start = start
+
     def _update_learning_rate(
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
+        self._start_adaptive_learning_rate()
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)
             return
@@ -197,8 +202,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
-
-    # The update
 
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
@@ -276,6 +279,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
+        reason = reason_kernels_are_off(self.policy) if self.n_rollouts == 1 else None
+        if reason is not None:
+            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
@@ -288,12 +294,10 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(*args, **kwargs)
-        reason = reason_kernels_are_off(self.policy)
-        if reason is not None and self.num_timesteps == 0:
-            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
-        return prepared
+    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
+        """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
+        options.note_changed_options(self)
+        super().save(path, exclude, include)
 
     def learn(
         self: SelfFlow,

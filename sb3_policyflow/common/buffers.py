@@ -8,10 +8,11 @@ import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.tree import rows, tensors
+from sb3_policyflow.common.tree import are_small, rows, tensors
+from sb3_policyflow.resilience.collection import PendingBonus
 
 SHUFFLED_AT_ONCE = 2**26
-"""Bytes of a rollout up to which a shuffled copy of it is made for each epoch."""
+"""Bytes of a rollout of small rows up to which a shuffled copy of it is made for each epoch."""
 
 
 class FlowRolloutBufferSamples(NamedTuple):
@@ -39,10 +40,13 @@ class RecordBufferMixin(RolloutBuffer):
     """
 
     record_type: type[Any] | None
+    pending_bonus: PendingBonus | None
+    """What is to be added to the rewards of the next step: see :class:`PendingBonus`."""
 
     def reset(self) -> None:
         """Forget all transitions."""
         self.record_type = None
+        self.pending_bonus = None
         super().reset()
         # SB3 stores actions in the dtype of the space, which may have less than single precision.
         self.actions = self.actions.astype(np.float32, copy=False)
@@ -71,6 +75,9 @@ class RecordBufferMixin(RolloutBuffer):
             self._allocate(record)
         for name, values in record._asdict().items():
             getattr(self, name)[self.pos] = values.cpu().numpy()
+        if self.pending_bonus is not None:
+            reward = self.pending_bonus.settle(reward)
+            self.pending_bonus = None
         # NaN shows at once where log probabilities are read from this buffer by mistake.
         no_log_prob = th.full((self.n_envs,), th.nan, dtype=th.float32, device="cpu")
         super().add(obs, action, reward, episode_start, value, no_log_prob)
@@ -126,8 +133,9 @@ class RecordBufferMixin(RolloutBuffer):
         )
         size = batch_size or n_samples
         parts = [slice(start, start + size) for start in range(0, n_samples, size)]
-        if sum(tensor.nbytes for tensor in tensors(samples)) <= SHUFFLED_AT_ONCE:
-            # Many views of one shuffled copy are faster than many gathers of few rows.
+        n_bytes = sum(tensor.nbytes for tensor in tensors(samples))
+        if n_bytes <= SHUFFLED_AT_ONCE and are_small(samples):
+            # Many views of one shuffled copy are faster than many gathers of few small rows.
             shuffled = rows(samples, indices)
             yield from (rows(shuffled, part) for part in parts)
         else:

@@ -24,11 +24,15 @@ Check = Callable[[str, object], object]
 def check_options(options: object) -> None:
     """Check the attributes that the tables ``option_checks`` of a class and its bases name.
 
+    Then the class's ``combination_checks``, functions that refuse options that do not go together.
+
     :raises ValueError: With the first one that cannot be used.
     """
     for cls in reversed(type(options).__mro__):
         for name, check in vars(cls).get("option_checks", {}).items():
             check(name, getattr(options, name))
+    for combined in getattr(options, "combination_checks", ()):
+        combined(options)
 
 
 def one_of(choices: Collection[str]) -> Check:
@@ -121,7 +125,8 @@ def bounds(name: str, value: object) -> None:
 def positive_bounds(name: str, value: object) -> None:
     """A lowest and a highest positive number."""
     bounds(name, value)
-    if not value[0] > 0:  # type: ignore[index]  # two numbers by now
+    ends: Any = value
+    if not ends[0] > 0:
         raise ValueError(f"{name} must be positive, got {value!r}.")
 
 

@@ -3,8 +3,7 @@
 import functools
 import inspect
 import math
-import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypedDict, cast
 
 import torch as th
@@ -13,11 +12,10 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.names import unknown_argument, with_present_names
 from sb3_policyflow.common.schedules import Coefficient, check_lr_adaptation, parse_schedule
 
 P = ParamSpec("P")
-FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
-"""Present values of options by option and former value."""
 
 
 class FlowOptions(TypedDict, total=False):
@@ -55,6 +53,7 @@ class FlowOptions(TypedDict, total=False):
     lr_adaptation_kwargs: dict[str, Any] | None
     advantage_scope: str
     timeout_bootstrap: str
+    allow_nan_observations: bool
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
@@ -112,6 +111,7 @@ def shares_options(
         @functools.wraps(init)
         def completed(*args: Any, **options: Any) -> None:
             options = with_present_names(options, former_names)
+            _check_names(signature, policy_class, args, options)
             given = signature.bind(*args, **options).arguments
             twice = sorted(names & given.keys() & (given.get("policy_kwargs") or {}).keys())
             if twice:
@@ -119,7 +119,7 @@ def shares_options(
                 raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
             cast("Callable[..., None]", init)(**{**defaults, **given})
 
-        completed.__signature__ = signature  # type: ignore[attr-defined]  # inspect looks here
+        vars(completed)["__signature__"] = signature  # where inspect looks for it
         return cast("Callable[P, None]", completed)
 
     return complete
@@ -146,26 +146,94 @@ def _named(signature: inspect.Signature) -> dict[str, inspect.Parameter]:
     return {name: p for name, p in signature.parameters.items() if p.kind not in collecting}
 
 
+def _check_names(
+    signature: inspect.Signature,
+    policy_class: type[Any],
+    args: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> None:
+    """Refuse arguments that an algorithm does not have, and one that would have no effect.
+
+    :raises TypeError: With where an argument belongs, or which one may be meant.
+    :raises ValueError: If options of gSDE are given.
+    """
+    model, policy, *_ = (*args, options.get("policy"))
+    if isinstance(policy, type) and issubclass(policy, policy_class):
+        policy_class = policy
+    own = signature.parameters.keys() - {"self"}
+    for name in options.keys() - own:
+        of_policy = _policy_parameters(policy_class).keys() - own
+        raise unknown_argument(type(model).__name__, name, own, of_policy)
+    if options.get("sde_sample_freq", -1) != -1:
+        raise ValueError(
+            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
+            "not support: leave it out."
+        )
+
+
 def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
     """The keyword-only parameters of a policy's constructors, its own options."""
-    options: dict[str, inspect.Parameter] = {}
+    parameters = _policy_parameters(policy_class).values()
+    return [parameter for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+
+
+def _policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
+    """What the constructors of a policy and of its bases take from ``policy_kwargs``."""
+    found: dict[str, inspect.Parameter] = {}
     for cls in policy_class.__mro__:
         if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
-            parameters = inspect.signature(vars(cls)["__init__"]).parameters
-            options |= {n: p for n, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
-    return list(options.values())
+            found |= _named(inspect.signature(vars(cls)["__init__"]))
+    for name in ("self", "observation_space", "action_space", "lr_schedule", "use_sde"):
+        found.pop(name, None)
+    return found
+
+
+class PolicyOption:
+    """An option of the policy as an attribute of its algorithm: setting it has its effect.
+
+    :param name: The option.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, owner: type[Any] | None = None) -> Any:
+        return self if model is None else getattr(model.policy, self._name)
+
+    def __set__(self, model: Any, value: object) -> None:
+        policy, name = model.policy, self._name
+        if name in policy.fixed_options:
+            raise AttributeError(
+                f"{name} cannot change, because the policy was made with it: save the model and "
+                f"load it with load(file, {name}={value!r}), or make another one."
+            )
+        former = getattr(policy, name)
+        setattr(policy, name, value)
+        try:
+            checks.check_options(policy)
+        except ValueError:
+            setattr(policy, name, former)
+            raise
 
 
 def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Let a constructor take options under their former names too, with a warning.
+    """Let a policy take options under their former names too, with a warning.
+
+    Where it does not hand others on, those that it does not have are refused with a sentence.
 
     :param former_names: Present names by former ones.
     """
 
     def extend(init: Callable[P, None]) -> Callable[P, None]:
+        parameters = inspect.signature(init).parameters
+        hands_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+
         @functools.wraps(init)
         def extended(*args: P.args, **options: P.kwargs) -> None:
             present = with_present_names(options, former_names)
+            for name in present.keys() - parameters.keys() if not hands_on else ():
+                owner = type(args[0])
+                raise unknown_argument(owner.__name__, name, _policy_parameters(owner))
             cast("Callable[..., None]", init)(*args, **present)
 
         return extended
@@ -173,30 +241,16 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
     return extend
 
 
-def with_present_names(
-    options: Mapping[str, Any], former_names: Mapping[str, str], warn: bool = True
-) -> dict[str, Any]:
-    """Options under their present names; where one has changed, a ``DeprecationWarning``.
+def note_changed_options(model: Any) -> None:
+    """Take up into ``policy_options`` what has been changed on the policy itself.
 
-    >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
-    {'size': 2, 'rule_kwargs': {'factor': 3}}
-
-    :param options: Options by name, former or present.
-    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
-        become a key of another one.
-    :param warn: Whether to warn. Options that come from a file are nobody's mistake.
+    :param model: An algorithm that is about to be saved.
     """
-    present = {name: value for name, value in options.items() if name not in former_names}
-    for former in former_names.keys() & options.keys():
-        name, _, key = former_names[former].partition(".")
-        present[name] = (
-            {**(present.get(name) or {}), key: options[former]} if key else options[former]
-        )
-        _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
-    for name, former in _former_values(present):
-        present[name] = FORMER_VALUES[name, former]
-        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
-    return present
+    given = {**model.policy_kwargs, **model.policy_options}
+    for option in own_options(model.policy_base):
+        value = getattr(model.policy, option.name)
+        if value != given.get(option.name, option.default):
+            model.policy_options[option.name] = value
 
 
 def read_loaded_options(model: Any) -> None:
@@ -224,6 +278,12 @@ def check_algorithm(model: Any) -> None:
     checks.check_environment(name, model.env, space)
     checks.check_flow_spaces(model.action_space, model.use_sde)
     checks.check_policy_class(name, model.policy_class, model.policy_base)
+    for option in (model.policy_kwargs or {}).keys() - _policy_parameters(model.policy_class):
+        if option in inspect.signature(type(model)).parameters:
+            raise TypeError(
+                f"{option} is an option of the algorithm and not of its policy: take it out of "
+                f"policy_kwargs, as {name}(..., {option}=...)."
+            )
     checks.check_options(model)
     checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
     if model.desired_kl is None:
@@ -236,12 +296,3 @@ def check_algorithm(model: Any) -> None:
             "With desired_kl the learning rate follows the divergence of the policy: give the "
             "learning_rate that it starts with, not a schedule."
         )
-
-
-def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
-
-
-def _warn_if(warn: bool, change: str) -> None:
-    if warn:
-        warnings.warn(f"{change}: use the new name.", DeprecationWarning, stacklevel=4)

@@ -1,5 +1,6 @@
 """What the policies of all flow algorithms share: networks, values, and how an action is made."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -7,7 +8,7 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -19,10 +20,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.optimization import make_optimizer
+from sb3_policyflow.common.names import check_overridden_methods
 from sb3_policyflow.common.options import accepts_former_names, own_options
+from sb3_policyflow.common.update import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
-from sb3_policyflow.kernels import KernelCritic, make_velocity_field
+from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
+from sb3_policyflow.resilience.finite import NotFiniteError
 
 NetArch = list[int] | dict[str, list[int]]
 
@@ -73,6 +76,9 @@ class FlowPolicy(ActorCriticPolicy):
         "initialization": checks.one_of(INITIALIZATIONS),
     }
 
+    fixed_options: ClassVar[frozenset[str]] = frozenset()
+    """Own options that cannot change, because networks or parameters were made with them."""
+
     velocity: VelocityField
     mlp_extractor: MlpExtractor
 
@@ -99,6 +105,7 @@ class FlowPolicy(ActorCriticPolicy):
         random_latents: bool = False,
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
+        check_overridden_methods(type(self), FlowPolicy)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
@@ -142,7 +149,10 @@ class FlowPolicy(ActorCriticPolicy):
         return list(arch.get(head, [])) if isinstance(arch, dict) else list(arch)
 
     def _build_mlp_extractor(self) -> None:
-        """Build the critic's hidden layers; the actor's belong to the velocity field."""
+        """Build the critic's hidden layers; the actor's belong to the velocity field.
+
+        If a subclass builds others, the velocity gets what their ``forward_actor`` returns.
+        """
         self.mlp_extractor = MlpExtractor(
             self.features_dim,
             net_arch={"pi": [], "vf": self._layers("vf")},
@@ -153,11 +163,13 @@ class FlowPolicy(ActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         # SB3 has made those of a Gaussian actor, and the optimizer of its parameters.
-        del self.action_net, self.log_std
+        del self.action_net, self.action_dist, self.log_std
         self._build_actor()
         self._kernel_critic = KernelCritic()
+        fixed = "velocity.time_embedding.frequencies"  # of the velocity, and of a copy of it
+        learned = (p for name, p in self.named_parameters() if not name.endswith(fixed))
         self.optimizer = make_optimizer(
-            self.optimizer_class, self.parameters(), lr_schedule(1), self.optimizer_kwargs
+            self.optimizer_class, learned, lr_schedule(1), self.optimizer_kwargs
         )
 
     @abstractmethod
@@ -167,7 +179,7 @@ class FlowPolicy(ActorCriticPolicy):
     def _make_velocity_field(self) -> VelocityField:
         return make_velocity_field(
             self.action_dim,
-            self.features_dim,
+            self.mlp_extractor.latent_dim_pi,
             net_arch=self._layers("pi"),
             activation_fn=self.activation_fn,
             embedding_dim=self.embedding_dim,
@@ -185,22 +197,30 @@ class FlowPolicy(ActorCriticPolicy):
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim)."""
-        # BasePolicy's extract_features serves one extractor, ActorCriticPolicy's always both.
-        return super(ActorCriticPolicy, self).extract_features(obs, self.pi_features_extractor)
+        is_own = type(self).extract_features is not ActorCriticPolicy.extract_features
+        if self.share_features_extractor or is_own:
+            features = self.extract_features(obs)
+        else:
+            # BasePolicy's serves one extractor, ActorCriticPolicy's both.
+            extract = super(ActorCriticPolicy, self).extract_features
+            features = extract(obs, self.pi_features_extractor)
+        actor = features[0] if isinstance(features, tuple) else features
+        return self.mlp_extractor.forward_actor(actor)
 
     def actor_critic_features(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Features for actor and critic, extracted once where they are shared."""
         features = self.extract_features(obs)
-        return features if isinstance(features, tuple) else (features, features)
+        actor, critic = features if isinstance(features, tuple) else (features, features)
+        return self.mlp_extractor.forward_actor(actor), critic
 
     def set_training_mode(self, mode: bool) -> None:
         """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
-        modules: list[nn.Module | None] = [self]
+        modules: list[Any] = [self]
         for module in modules:  # grows; much faster than Module.modules()
-            if module is not None and module.training is not mode:
+            if module.training is not mode:
                 super().set_training_mode(mode)
                 return
-            modules += module._modules.values() if module is not None else ()
+            modules += [part for part in module._modules.values() if part is not None]
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
@@ -251,14 +271,25 @@ class FlowPolicy(ActorCriticPolicy):
         """
         actor_features, critic_features = self.actor_critic_features(obs)
         actions, record = self.sample_actions(actor_features, deterministic)
-        return self._shaped(actions), self.values(critic_features), record
+        return self._finished(actions), self.values(critic_features), record
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actions, _ = self.sample_actions(self.actor_features(observation), deterministic)
-        return self._shaped(actions)
+        return self._finished(actions)
 
-    def _shaped(self, actions: th.Tensor) -> th.Tensor:
+    def _finished(self, actions: th.Tensor) -> th.Tensor:
+        """Actions in the shape of their space, (n, ...).
+
+        :raises NotFiniteError: If one is not finite, as SB3's PPO does before anything acts on it.
+        """
         assert self.action_space.shape is not None
+        # The sum of finite numbers is finite but for overflow, and takes half the time.
+        if has_values() and not math.isfinite(actions.sum()) and not actions.isfinite().all():
+            row = int((~actions.isfinite()).any(dim=-1).nonzero()[0])
+            raise NotFiniteError(
+                f"The policy's action is not finite, for observation {row} of the batch: look for "
+                "such numbers in observation and parameters, or load an earlier checkpoint."
+            )
         return actions.reshape(-1, *self.action_space.shape)
 
     def keep_within_bounds(self) -> None:
@@ -268,33 +299,19 @@ class FlowPolicy(ActorCriticPolicy):
         """Refuse: SB3's distributions say how likely actions are."""
         raise self._no_likelihood()
 
-    def evaluate_actions(
-        self,
-        obs: PyTorchObs,  # noqa: ARG002
-        actions: th.Tensor,  # noqa: ARG002
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> Any:  # noqa: ARG002
         """Refuse: the likelihood of an action under a flow policy has no closed form."""
         raise self._no_likelihood()
+
+    def reset_noise(self, n_envs: int = 1) -> None:  # noqa: ARG002
+        """Refuse: this is gSDE's noise."""
+        raise TypeError(f"{type(self).__name__} does not support gSDE, whose noise this resets.")
 
     def _no_likelihood(self) -> TypeError:
         return TypeError(
             f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
             "flow algorithms of sb3_policyflow, which need none."
         )
-
-
-def policy_aliases(
-    mlp: type[FlowPolicy], cnn: type[FlowPolicy], multi_input: type[FlowPolicy]
-) -> dict[str, type[BasePolicy]]:
-    """An algorithm's policies by the names of flow policies and by those of SB3."""
-    return {
-        "MlpFlowPolicy": mlp,
-        "CnnFlowPolicy": cnn,
-        "MultiInputFlowPolicy": multi_input,
-        "MlpPolicy": mlp,
-        "CnnPolicy": cnn,
-        "MultiInputPolicy": multi_input,
-    }
 
 
 FlowActorCriticPolicy = FlowPolicy

@@ -7,7 +7,10 @@ import torch as th
 
 T = TypeVar("T")
 CHUNK = 8192
-"""Rows evaluated at a time: large enough to be fast, small enough for images."""
+"""Rows evaluated at a time where rows are small."""
+SMALL_ROW = 1024
+"""Numbers in a row up to which it is small. An image has more, and a features extractor makes
+several times as many of them: of images, no more are evaluated at a time than training does."""
 
 
 def map_tensors(function: Callable[[th.Tensor], th.Tensor], tree: T) -> T:
@@ -48,17 +51,37 @@ def tensors(tree: Any) -> Iterator[th.Tensor]:
             yield from tensors(part)
 
 
-def in_chunks(function: Callable[[T], th.Tensor], tree: T) -> th.Tensor:
+def are_small(tree: Any) -> bool:
+    """Whether the rows of nested tensors are small: see :data:`SMALL_ROW`.
+
+    >>> are_small({"a": th.zeros(5, 3)}), are_small((th.zeros(5), th.zeros(5, 3, 84, 84)))
+    (True, False)
+    """
+    return sum(tensor[:1].numel() for tensor in tensors(tree)) <= SMALL_ROW
+
+
+def in_chunks(function: Callable[[T], th.Tensor], tree: T, batch_size: int) -> th.Tensor:
     """Apply a function to the rows of nested tensors, some at a time, without gradients.
 
-    >>> in_chunks(lambda pair: pair[0] + pair[1], (th.ones(3), th.arange(3)))
+    >>> in_chunks(lambda pair: pair[0] + pair[1], (th.ones(3), th.arange(3)), batch_size=2)
     tensor([1., 2., 3.])
 
     :param function: Maps k rows of ``tree`` to a tensor (k, ...).
     :param tree: Tensors (n, ...) in dictionaries and tuples.
+    :param batch_size: How many large rows may be evaluated at a time, at most.
     :return: The results in order, shape (n, ...).
     """
     n_rows = len(next(tensors(tree)))
+    size = CHUNK if are_small(tree) else min(batch_size, CHUNK)
     with th.no_grad():
-        starts = range(0, n_rows, CHUNK)
-        return th.cat([function(rows(tree, slice(start, start + CHUNK))) for start in starts])
+        first = function(rows(tree, slice(0, size)))
+        if size >= n_rows:
+            return first
+        # One tensor: many small ones would lie between what a chunk takes and gives back, and keep
+        # its memory from being used again.
+        results = first.new_empty(n_rows, *first.shape[1:])
+        results[:size] = first
+        for start in range(size, n_rows, size):
+            part = slice(start, start + size)
+            results[part] = function(rows(tree, part))
+        return results

@@ -1,13 +1,15 @@
-"""The part of an update in which the flow algorithms differ, for one rollout."""
+"""What an update consists of: an algorithm's part of it, metrics, optimizer and gradients."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES
+from sb3_policyflow.kernels import clip_gradients_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -41,6 +43,7 @@ class FlowUpdate(ABC):
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
+        self.batch_size: int = algorithm.batch_size
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
         self.log_ratio_clamp: float | None = None
@@ -121,3 +124,50 @@ class UpdateMetrics:
         if not reduced:
             return {}
         return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))
+
+
+def make_optimizer(
+    optimizer_class: type[th.optim.Optimizer],
+    parameters: Iterable[th.nn.Parameter],
+    learning_rate: float,
+    options: dict[str, Any],
+) -> th.optim.Optimizer:
+    """An optimizer, in its fused implementation if it has one and the user does not choose.
+
+    >>> make_optimizer(th.optim.Adam, [th.nn.Parameter(th.ones(1))], 1e-3, {}).defaults["fused"]
+    True
+
+    :param optimizer_class: Its class.
+    :param parameters: What it optimizes.
+    :param learning_rate: Its learning rate.
+    :param options: Its other arguments.
+    """
+    arguments = {"lr": learning_rate, **options}
+    is_open = not {"fused", "foreach", "capturable", "differentiable"} & options.keys()
+    if optimizer_class in (th.optim.Adam, th.optim.AdamW) and is_open:
+        parameters = list(parameters)
+        try:
+            return optimizer_class(parameters, fused=True, **arguments)
+        except RuntimeError:
+            pass  # torch has no such implementation for this device
+    return optimizer_class(parameters, **arguments)
+
+
+def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math.inf) -> float:
+    """Scale the gradients to a Euclidean norm of all together, if theirs is greater.
+
+    Gradients that are not finite are left alone.
+
+    :param parameters: Parameters, at least one with a gradient.
+    :param max_norm: The norm.
+    :return: The norm that they had.
+    """
+    grads = [p.grad for p in parameters if p.grad is not None]
+    norm = clip_gradients_in_place(grads, max_norm)
+    if norm is not None:
+        return norm
+    norm = float(th.cat([grad.reshape(-1) for grad in grads]).norm())
+    factor = max_norm / (norm + 1e-6)
+    if factor < 1 and math.isfinite(norm):
+        th._foreach_mul_(grads, factor)
+    return norm

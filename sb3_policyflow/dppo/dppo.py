@@ -13,8 +13,8 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.entropy import EntropyBonus
+from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
-from sb3_policyflow.common.policies import policy_aliases
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.dppo.policies import (
     CnnFlowPolicy,
@@ -23,6 +23,7 @@ from sb3_policyflow.dppo.policies import (
     DPPORecord,
     MlpFlowPolicy,
     MultiInputFlowPolicy,
+    warn_of_wide_bounds,
 )
 
 
@@ -84,6 +85,20 @@ class DPPOUpdate(FlowUpdate):
         return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)
 
 
+def check_warmup(model: Any) -> None:
+    """Refuse to train a critic alone that cannot be told from the actor.
+
+    :raises TypeError: If the policy has networks of the user's own without a ``value_net``.
+    """
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
+        )
+
+
 class DPPO(FlowOnPolicyAlgorithm):
     """On-policy learning with diffusion policies.
 
@@ -128,6 +143,7 @@ class DPPO(FlowOnPolicyAlgorithm):
         "n_entropy_actions": checks.at_least(2),
         "n_entropy_states": checks.at_least(1),
     }
+    model_checks = (warn_of_wide_bounds, check_warmup)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(

@@ -1,5 +1,6 @@
 """Policies of DPPO: an action is the end of a chain of Gaussian steps."""
 
+import warnings
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, ClassVar, NamedTuple
@@ -41,6 +42,49 @@ class DPPORecord(NamedTuple):
     means: th.Tensor
 
 
+SHORTEST_MEANINGLESS = 200.0
+"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
+others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
+ADVICE = (
+    "use process='flow', which does not scale, or give the environment bounds that mean something "
+    "(gymnasium.wrappers.TransformAction)"
+)
+
+
+def _check_bounds(action_space: spaces.Space[Any]) -> None:
+    """Refuse bounds so wide that "ddpm" cannot scale actions to them."""
+    assert isinstance(action_space, spaces.Box)
+    with np.errstate(over="ignore"):
+        widths = action_space.high - action_space.low
+    if not np.isfinite(widths).all():
+        raise ValueError(
+            "process='ddpm' scales actions to their bounds, but those from "
+            f"{action_space.low.min():g} to {action_space.high.max():g} are further apart than a "
+            f"{widths.dtype} can tell: {ADVICE}."
+        )
+
+
+def warn_of_wide_bounds(model: Any) -> None:
+    """Warn where bounds seem to mean nothing, to which "ddpm" scales actions nevertheless.
+
+    An untrained policy has a standard deviation of about a fifth of their distance, and what it
+    explores in the end is in proportion to it, too.
+
+    :param model: A model, which is new if it has not seen a timestep.
+    """
+    box, policy = model.action_space, model.policy
+    if policy.process != "ddpm" or model.num_timesteps > 0:
+        return
+    width = (box.high - box.low).max()
+    if width >= SHORTEST_MEANINGLESS:
+        warnings.warn(
+            f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
+            f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "
+            f"stand for none, {ADVICE}.",
+            stacklevel=2,
+        )
+
+
 class DPPOPolicy(FlowPolicy):
     """Actor-critic policy that denoises an action in several steps.
 
@@ -72,6 +116,9 @@ class DPPOPolicy(FlowPolicy):
         "noise_clip": checks.positive_or_none,
         "denoised_clip": checks.positive,
     }
+    fixed_options = frozenset(
+        {"process", "n_denoising_steps", "n_finetuned_steps", "denoised_clip", "identity_skip"}
+    )
 
     def __init__(
         self,
@@ -112,6 +159,7 @@ class DPPOPolicy(FlowPolicy):
             )
         self.chain: DenoisingProcess
         if self.process == "ddpm":
+            _check_bounds(self.action_space)
             self.chain = DDPM(self.n_denoising_steps, self.denoised_clip, self.identity_skip)
         else:
             self.chain = EulerChain(self.n_denoising_steps)
@@ -119,6 +167,8 @@ class DPPOPolicy(FlowPolicy):
             self.base_velocity = deepcopy(self.velocity).requires_grad_(False)
             self.base_features_extractor = deepcopy(self.pi_features_extractor)
             self.base_features_extractor.requires_grad_(False)
+            if self._has_own_networks:
+                self.base_mlp_extractor = deepcopy(self.mlp_extractor).requires_grad_(False)
 
     @property
     def n_evaluations_per_action(self) -> int:
@@ -127,12 +177,15 @@ class DPPOPolicy(FlowPolicy):
     def freeze_base(self) -> None:
         """Let the steps that are not trained use the networks as they are now, say after imitation.
 
-        These are the velocity field and the actor's features extractor.
+        These are the velocity field, the actor's features extractor, and networks between them of
+        one's own.
         """
         if self.n_frozen_steps > 0:
             self.base_velocity.load_state_dict(self.velocity.state_dict())
             extractor = self.pi_features_extractor.state_dict()
             self.base_features_extractor.load_state_dict(extractor)
+            if self._has_own_networks:
+                self.base_mlp_extractor.load_state_dict(self.mlp_extractor.state_dict())
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim).
@@ -150,13 +203,20 @@ class DPPOPolicy(FlowPolicy):
     @property
     def _has_base_features(self) -> bool:
         learns = any(True for _ in self.pi_features_extractor.parameters())
-        return self.n_frozen_steps > 0 and learns
+        return self.n_frozen_steps > 0 and (learns or self._has_own_networks)
+
+    @property
+    def _has_own_networks(self) -> bool:
+        """Whether a policy of the user's own puts networks between extractor and velocity."""
+        return type(self)._build_mlp_extractor is not FlowPolicy._build_mlp_extractor
 
     def _with_base(self, features: th.Tensor, obs: PyTorchObs) -> th.Tensor:
         if not self._has_base_features:
             return features
-        extract = super(ActorCriticPolicy, self).extract_features
-        return th.cat([features, extract(obs, self.base_features_extractor)], dim=-1)
+        base = super(ActorCriticPolicy, self).extract_features(obs, self.base_features_extractor)
+        if self._has_own_networks:
+            base = self.base_mlp_extractor.forward_actor(base)
+        return th.cat([features, base], dim=-1)
 
     @property
     def log_prob_stds(self) -> th.Tensor:

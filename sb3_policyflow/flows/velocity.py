@@ -30,7 +30,9 @@ class FourierTimeEmbedding(nn.Module):
     :raises ValueError: If there are no frequencies.
     """
 
-    frequencies: th.Tensor
+    frequencies: nn.Parameter
+    """Shape (n_frequencies,). A parameter, as those that are drawn are part of what makes the
+    policy, but one that is never learned."""
 
     def __init__(
         self,
@@ -43,7 +45,7 @@ class FourierTimeEmbedding(nn.Module):
         if frequencies is None:
             frequencies = max(embedding_dim // 2, 1)
         values = _given_or_drawn(frequencies, frequency_scale)
-        self.register_buffer("frequencies", values)
+        self.frequencies = nn.Parameter(values, requires_grad=False)
         self.mlp = nn.Sequential(
             nn.Linear(2 * len(values), embedding_dim),
             activation_fn(),
@@ -52,7 +54,7 @@ class FourierTimeEmbedding(nn.Module):
 
     def forward(self, times: th.Tensor) -> th.Tensor:
         """Embed times of shape (...) into shape (..., embedding_dim)."""
-        inputs = fourier_features(times, self.frequencies)
+        inputs = fourier_features(times, self.frequencies.detach())
         # Other linear layers than torch's, such as quantized ones, take nothing but rows.
         embedding: th.Tensor = self.mlp(inputs if times.dim() > 0 else inputs.unsqueeze(0))
         return embedding.view(*times.shape, embedding.shape[-1])
@@ -210,7 +212,8 @@ def _glorot_zero_output(field: VelocityField) -> None:
 def _zero(field: VelocityField) -> None:
     """Zero everywhere (paper: ZI)."""
     for parameter in field.parameters():
-        nn.init.zeros_(parameter)
+        if parameter is not field.time_embedding.frequencies:
+            nn.init.zeros_(parameter)
 
 
 INITIALIZATIONS: dict[str, Callable[[VelocityField], None]] = {

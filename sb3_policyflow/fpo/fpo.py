@@ -13,8 +13,8 @@ from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.entropy import EntropyBonus
 from sb3_policyflow.common.losses import SURROGATES, ratio_divergence
+from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
-from sb3_policyflow.common.policies import policy_aliases
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.flows import TIME_SAMPLERS
@@ -63,6 +63,7 @@ class FPOUpdate(FlowUpdate):
         losses = in_chunks(
             lambda part: self.losses(part, policy.actor_features(part.observations)),
             rollout._replace(drawn=drawn),
+            self.batch_size,
         )
         self.drawn = drawn._replace(reference_losses=losses)
 

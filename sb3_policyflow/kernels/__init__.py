@@ -25,10 +25,12 @@ from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels.critic import KernelCritic, reason_kernels_are_off
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.gradients import clip_gradients_in_place
+from sb3_policyflow.kernels.inspection import has_values
 
 __all__ = [
     "KernelCritic",
     "clip_gradients_in_place",
+    "has_values",
     "make_velocity_field",
     "reason_kernels_are_off",
 ]

@@ -89,7 +89,7 @@ def _read_field(kernels: Kernels, inspector: ModuleInspector, field: VelocityFie
     mlp = inspector.child(embedding, "mlp")
     inspector.require_no_hooks(field, hidden, embedding, mlp)
     return FieldParts(
-        inspector.buffer(embedding, "frequencies"),
+        inspector.parameter(embedding, "frequencies"),
         read_mlp(kernels, inspector, inspector.children(mlp)),
         inspector.layer(inspector.child(field, "observation_embedding")),
         read_mlp(
@@ -180,7 +180,8 @@ class _Embedding:
         """
         table, entries, shifts = self._first[:3]
         if times_shape != leading:
-            entries = np.broadcast_to(entries.reshape(times_shape), leading).reshape(-1)
+            # A copy: numba would compile the kernels again for a view that is not contiguous.
+            entries = np.broadcast_to(entries.reshape(times_shape), leading).flatten()
         stride = self._parts.network.n_inputs
         return KernelInput(points, stride, table[: len(self._times)], entries, shifts)
 
@@ -240,13 +241,13 @@ class _FieldEvaluation(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_outputs: th.Tensor) -> Any:
-        saved, points, features, _, *parameters = ctx.saved_tensors
+        saved, points, features, frequencies, *parameters = ctx.saved_tensors
         if th.is_grad_enabled():
             reference = _Reference(ctx.field, ctx.times)
             grads = differentiable_gradients(
-                reference, [points, features], parameters, grad_outputs
+                reference, [points, features], [frequencies, *parameters], grad_outputs
             )
-            return None, None, None, *grads
+            return None, None, None, *grads[:2], *grads[3:]
         needs_points, needs_features = ctx.needs_input_grad[3:5]
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])

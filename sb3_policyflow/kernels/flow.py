@@ -10,7 +10,7 @@ from sb3_policyflow.flows.folding import split_first_layer
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
 from sb3_policyflow.flows.velocity import fourier_features
 from sb3_policyflow.kernels.inspection import addresses
-from sb3_policyflow.kernels.layouts import Array, FoldedNetwork, Kernels, Method
+from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Integers, Kernels, Method
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
 if TYPE_CHECKING:  # that module imports this one
@@ -140,7 +140,7 @@ def _make_plan(
     return FlowPlan(network.kernels, folded, method, time_indices.size * network.flops_per_row)
 
 
-def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Array, Array]:
+def _tableau(solver: Solver, n_steps: int, end_time: float) -> tuple[Integers, Floats]:
     """``time_indices`` and ``tableau`` of a :class:`Method`."""
     memory = 0.0
     if isinstance(solver, AdamsBashforth2):

@@ -69,12 +69,12 @@ class ModuleInspector:
         """All modules within a module."""
         return [self.child(module, name) for name in module._modules]
 
-    def buffer(self, module: nn.Module, name: str) -> Any:
-        """A tensor of a module that is not a parameter."""
-        tensor: Any = module._buffers[name]
-        self._places.append((module._buffers, name, tensor))
-        require_usable(tensor)
-        return tensor
+    def parameter(self, module: nn.Module, name: str) -> Any:
+        """A parameter of a module."""
+        parameter: Any = module._parameters[name]
+        self._places.append((module._parameters, name, parameter))
+        require_usable(parameter)
+        return parameter
 
     def layer(self, module: nn.Module) -> Layer:
         """The parameters of a module that is nothing but linear.
@@ -205,6 +205,12 @@ def _is_watched() -> bool:
     """Whether torch's functions have a mode; that of the default device changes no tensor."""
     modes = range(th._C._len_torch_function_stack())
     return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
+
+
+def has_values() -> bool:
+    """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
+    is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
+    return not is_traced and th._C._functorch.peek_interpreter_stack() is None
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:

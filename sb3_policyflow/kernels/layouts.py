@@ -6,7 +6,7 @@ their shapes, so they are made from a module's current tensors for each call, se
 arrays. Nothing here imports it.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,6 +210,3 @@ class Kernels(Protocol):
 
     def clip(self, addresses: Integers, sizes: Integers, max_norm: float) -> float:
         """Clip arrays to a norm of all together, and return the norm that they had."""
-
-
-Array = NDArray[Any]

@@ -34,6 +34,22 @@ class PolicyFlowRecord(NamedTuple):
     endpoints: th.Tensor
 
 
+def check_latents(policy: "PolicyFlowPolicy") -> None:
+    """Refuse latents of another standard deviation where there are none, or none of their own.
+
+    :raises ValueError: With what to leave out.
+    """
+    if policy.latent_std == 1.0:
+        return
+    if policy.gaussian:
+        raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
+    if INTERPOLANTS[policy.interpolant].stochastic:
+        raise ValueError(
+            f"With interpolant={policy.interpolant!r} the latents' standard deviation is 1: leave "
+            "out latent_std, or use interpolant='rectified' or interpolant='trigflow'."
+        )
+
+
 class PolicyFlowPolicy(BaseFlowPolicy):
     """Actor-critic policy that transports Gaussian latents along a flow (paper, policy).
 
@@ -66,6 +82,8 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         "log_std_init": checks.finite,
         "log_std_bounds": checks.or_none(checks.bounds),
     }
+    combination_checks = (check_latents,)
+    fixed_options = frozenset({"log_std_init"})
 
     @accepts_former_names(path="interpolant")
     def __init__(
@@ -95,18 +113,6 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self.log_std_init = log_std_init
         nn.init.constant_(self.log_std, log_std_init)
         self.keep_within_bounds()
-        self._check_latents()
-
-    def _check_latents(self) -> None:
-        if self.latent_std == 1.0:
-            return
-        if self.gaussian:
-            raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
-        if self.flow.interpolant.stochastic:
-            raise ValueError(
-                f"With interpolant={self.interpolant!r} the latents' standard deviation is 1: "
-                "leave out latent_std, or use interpolant='rectified' or interpolant='trigflow'."
-            )
 
     def _build_actor(self) -> None:
         self.velocity = self._make_velocity_field()
@@ -146,7 +152,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         if self.gaussian:
             latents = features.new_zeros(len(features), self.action_dim)
         else:
-            latents = self.latent_std * self.draw_latents(features, deterministic)
+            latents = self.draw_latents(features, deterministic)
+            if self.latent_std != 1.0:
+                latents = self.latent_std * latents
         endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:

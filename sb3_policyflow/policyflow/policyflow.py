@@ -17,8 +17,8 @@ from sb3_policyflow.common.losses import (
     gaussian_kl,
     shifted_gaussian_log_ratio,
 )
+from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
-from sb3_policyflow.common.policies import policy_aliases
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
@@ -59,7 +59,9 @@ class PolicyFlowUpdate(FlowUpdate):
         # Line 3: the reference policy, theta-hat and sigma-hat. Its features are extracted once.
         self.reference_field = deepcopy(policy.velocity)
         self.reference_log_std = policy.noise_log_std.detach().clone()
-        self.reference_features = in_chunks(policy.actor_features, rollout.observations)
+        self.reference_features = in_chunks(
+            policy.actor_features, rollout.observations, self.batch_size
+        )
         self.time_sampler = TIME_SAMPLERS[algorithm.time_sampler](self.flow.times())
         self.n_times = algorithm.n_times
         self.time_average = algorithm.time_average
@@ -80,7 +82,8 @@ class PolicyFlowUpdate(FlowUpdate):
         # Line 17: the interpolation points x_t.
         points = self.flow.interpolant.interpolate(latents, endpoints, times)
         inputs = points, times, self.reference_features.unsqueeze(1)
-        return PathSamples(times, points, in_chunks(lambda x: self.reference_field(*x), inputs))
+        velocity = in_chunks(lambda x: self.reference_field(*x), inputs, self.batch_size)
+        return PathSamples(times, points, velocity)
 
     def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
         """Importance ratio and regularizers from the change of the velocity."""

@@ -1,10 +1,11 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
+import functools
 import io
 import pathlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import numpy as np
 import torch as th
@@ -16,9 +17,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow.resilience.collection import (
     Infos,
-    RolloutVecEnv,
+    PendingBonus,
+    StepChecks,
     rollback_statistics,
     terminal_observations,
+    time_limits,
 )
 from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
 from sb3_policyflow.resilience.finite import check_rollout
@@ -26,13 +29,30 @@ from sb3_policyflow.resilience.saving import RandomStates, ResumeState
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
+    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
+
+    @functools.wraps(load)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        cls, *file = args
+        present = cls.former_names.get("path") if file and "path" in kwargs else None  # type: ignore[attr-defined]  # a class
+        if present is not None:
+            kwargs[present] = kwargs.pop("path")
+        return load(*args, **kwargs)
+
+    return wrapped
 
 
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """SB3's ``OnPolicyAlgorithm`` with guarded rollouts, whole files and exact resume.
 
-    - Rollouts are collected through a :class:`RolloutVecEnv`: numbers that are not finite, wrong
-      shapes and dead worker processes stop the training with a sentence, before parameters change.
+    - Rollouts are collected by SB3's loop, in the user's own environment, and checked step by step:
+      numbers that are not finite, wrong shapes and dead worker processes stop the training with a
+      sentence, before parameters change.
     - ``save`` writes a file completely or not at all, with the states of the random generators
       besides what SB3 saves: parameters, optimizer, counters, progress and last observations.
     - After ``load``, the next ``learn`` continues as if the run had not been interrupted.
@@ -43,8 +63,15 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     timeout_bootstrap: str = "terminal"
     """The value with which an episode cut by a time limit continues: that of the "terminal"
     observation, as in SB3, of the "current" one before it, or "none"."""
+    allow_nan_observations: bool = False
+    """Whether observations may have numbers that are not finite."""
 
-    _collector: RolloutVecEnv | None = None
+    former_names: ClassVar[Mapping[str, str]] = {}
+    """Present names of attributes by former ones, by which files and ``load`` may know them."""
+
+    _callback: BaseCallback | None = None
+    """The callback of the rollout that is being collected; its ``locals`` are the loop's."""
+    _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
 
@@ -54,6 +81,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     def _guarded(self) -> Iterator[VecEnv]:
         """A block that uses the environment; names its faults and undoes what can be undone."""
         assert self.env is not None
+        self._step_checks = StepChecks(self.env, self.allow_nan_observations)
         watched = watch_workers(self.env, lambda: self.num_timesteps)
         with watched, rollback_statistics(self.get_vec_normalize_env()):
             yield self.env
@@ -66,9 +94,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             raise ValueError(
                 "The model has no environment to learn in: give one to load, as env, or to set_env."
             )
-        with self._guarded() as env:
+        with self._guarded():
             prepared = super()._setup_learn(*args, **kwargs)
-            RolloutVecEnv(env, self.num_timesteps).check_observations(self._last_obs)
+            self._step_checks.check_observations(self._last_obs, self.num_timesteps)
         return prepared
 
     def collect_rollouts(
@@ -86,23 +114,28 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         first_timestep = self.num_timesteps
         try:
             with self._guarded():
-                self._collector = RolloutVecEnv(env, first_timestep)
-                complete = super().collect_rollouts(
-                    self._collector, callback, rollout_buffer, n_rollout_steps
-                )
+                self._callback = callback
+                complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
         finally:
-            self._collector = None
+            self._callback = None
         if complete:
             check_rollout(rollout_buffer, first_timestep)
         return complete
 
-    def _update_info_buffer(self, infos: Infos, dones: np.ndarray | None = None) -> None:
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
         # SB3's loop calls this after the callbacks and before it bootstraps.
         super()._update_info_buffer(infos, dones)
-        if self._collector is not None and dones is not None:
-            self._collector.bootstrap_timeouts(
-                infos, dones, lambda indices: self._timeout_values(infos, indices), self.gamma
-            )
+        if self._callback is None or dones is None:
+            return
+        step = self._callback.locals
+        self._step_checks.check_rewards(step["rewards"], self.num_timesteps)
+        self._step_checks.check_observations(step["new_obs"], self.num_timesteps)
+        indices = time_limits(infos, dones)
+        if indices and hasattr(self.rollout_buffer, "pending_bonus"):
+            values = self._timeout_values(infos, indices).flatten().cpu().numpy()
+            self.rollout_buffer.pending_bonus = PendingBonus(infos, indices, self.gamma * values)
 
     def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
         """Values of the states with which episodes continue beyond their time limits."""
@@ -110,9 +143,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             return th.zeros(len(indices), dtype=th.float32, device="cpu")
         observations: Any = self._last_obs
         if self.timeout_bootstrap == "terminal":
-            observations = terminal_observations(infos, indices)
-            assert self._collector is not None
-            self._collector.check_observations(observations, "terminal observation", indices)
+            observations = terminal_observations(infos, indices, self.observation_space)
+            kind = "terminal observation"
+            self._step_checks.check_observations(observations, self.num_timesteps, kind, indices)
         elif isinstance(observations, dict):
             observations = {key: values[indices] for key, values in observations.items()}
         else:
@@ -153,9 +186,15 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             del self.resume_state
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_collector", "_saved_random_states"]
+        return [
+            *super()._excluded_save_params(),
+            "_callback",
+            "_step_checks",
+            "_saved_random_states",
+        ]
 
     @classmethod
+    @_takes_former_path
     def load(
         cls: type[SelfResilient],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -174,7 +213,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         when the model was saved, so that training continues as it would have. Environments are
         seeded with the model's seed and reset, as in SB3, unless ``force_reset`` is False.
 
-        :param path: The file, or one opened for reading.
+        :param path: The file, or one opened for reading. An attribute among ``kwargs`` may have
+            this name too, if it is a former one and the file is given by position.
         :param env: The environment in which to continue.
         :param device: Where to put the model.
         :param custom_objects: Attributes to take instead of the saved ones.
@@ -198,6 +238,15 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed the generators; see SB3. Those that ``load`` has found are forgotten.
+
+        :param seed: The seed; nothing happens without one.
+        """
+        super().set_random_seed(seed)
+        if seed is not None:
+            self._saved_random_states = None
 
     def _continue_episodes(self, state: ResumeState | None) -> None:
         """Check an environment that is not reset against the last observations."""

@@ -6,6 +6,10 @@ import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 
 
+class NotFiniteError(FloatingPointError, ValueError):
+    """A number is not finite. SB3's PPO raises a ``ValueError`` for actions of this kind."""
+
+
 def check_finite(
     values: np.ndarray,
     what: str,
@@ -15,25 +19,24 @@ def check_finite(
 ) -> None:
     """Stop at a number that is not finite.
 
-    >>> check_finite(np.array([1.0, np.nan]), "The reward", 6, "mend the environment")
-    Traceback (most recent call last):
-    ...
-    FloatingPointError: The reward is not finite at timestep 6, in environment 1. \
-Training has stopped before its parameters were touched, and the model can be saved: mend the \
-environment.
+    >>> try:
+    ...     check_finite(np.array([1.0, np.nan]), "The reward", 6, "fix the environment")
+    ... except NotFiniteError as error:
+    ...     str(error)[:62]
+    'The reward is not finite at timestep 6, in environment 1. Trai'
 
     :param values: One row for each environment, shape (n, ...).
     :param what: The beginning of the sentence.
     :param timestep: When, for the message.
     :param advice: What to do.
     :param environments: Which environments the rows are of, if not all of them.
-    :raises FloatingPointError: With the first environment concerned.
+    :raises NotFiniteError: With the first environment concerned.
     """
     if np.isfinite(values).all():
         return
     row = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))[0]
     environment = row if environments is None else environments[row]
-    raise FloatingPointError(
+    raise NotFiniteError(
         f"{what} is not finite at timestep {timestep}, in environment {environment}. "
         "Training has stopped before its parameters were touched, and the model can be saved: "
         f"{advice}."

@@ -3,26 +3,46 @@
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import connection
+from multiprocessing import Pipe, connection
+from threading import Thread
 
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 
-def wait_for_workers(venv: VecEnv) -> None:
-    """Wait until every worker process has answered, or one has died.
+class FirstDeath:
+    """While a block runs, ends all workers of an environment when the first has died.
 
-    A dead worker's pipe tells its end, except under the start method "fork": there the other
-    workers have inherited it and hold it open, and SB3 would wait for an answer for ever.
+    A dead worker's pipe tells its end, and SB3 stops waiting for its answer, except under the start
+    method "fork": there the other workers have inherited the pipe and hold it open. Ending them
+    closes it.
 
-    :param venv: An environment without wrappers; nothing happens if it has no such workers.
-    :raises EOFError: If a worker has died.
+    :param env: The environment.
     """
-    if not isinstance(venv, SubprocVecEnv):
-        return
-    for remote, process in zip(venv.remotes, venv.processes, strict=True):
-        forked = type(process).__name__ == "ForkProcess"
-        if forked and process.sentinel in connection.wait([remote, process.sentinel]):
-            raise EOFError(f"{process.name} has ended.")
+
+    def __init__(self, env: SubprocVecEnv) -> None:
+        self._processes = env.processes
+        self._end, self._ended = Pipe()
+        self._thread = Thread(target=self._wait, name="sb3_policyflow workers", daemon=True)
+        self.indices: list[int] = []
+        """Which workers died first."""
+
+    def _wait(self) -> None:
+        sentinels = [process.sentinel for process in self._processes]
+        dead = connection.wait([*sentinels, self._ended])
+        self.indices = [index for index, one in enumerate(sentinels) if one in dead]
+        if self.indices and self._ended not in dead:
+            for process in self._processes:
+                process.terminate()
+
+    def __enter__(self) -> "FirstDeath":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.send(None)
+        self._thread.join()
+        self._end.close()
+        self._ended.close()
 
 
 @contextmanager
@@ -34,31 +54,36 @@ def watch_workers(venv: VecEnv, timestep: Callable[[], int]) -> Iterator[None]:
     :raises RuntimeError: If a worker has died. The others are ended too, because a
         ``SubprocVecEnv`` can neither replace one nor close without it.
     """
-    try:
+    env = venv.unwrapped
+    if not isinstance(env, SubprocVecEnv):
         yield
+        return
+    first = FirstDeath(env)
+    try:
+        with first:
+            yield
     except (EOFError, ConnectionError) as error:
-        env = venv.unwrapped
-        deaths = _deaths(env) if isinstance(env, SubprocVecEnv) else ""
+        deaths = _deaths(env, first.indices)
         if not deaths:
             raise
         _end_all(env)
         raise RuntimeError(
             f"A worker process of SubprocVecEnv has died after timestep {timestep()}: {deaths}. If "
             "its environment raised, the traceback is printed above. The model can be saved; make "
-            "the environments anew and give them to set_env to go on."
+            "the environments anew and give them to set_env to continue."
         ) from error
 
 
-def _deaths(env: SubprocVecEnv) -> str:
+def _deaths(env: SubprocVecEnv, first: list[int]) -> str:
     """Which workers have died, and how; nothing if none has."""
-    # A pipe may be closed a moment before its process is gone.
-    ended = connection.wait([process.sentinel for process in env.processes], timeout=1.0)
-    deaths = []
-    for index, process in enumerate(env.processes):
-        if process.sentinel in ended:
-            process.join(timeout=1.0)
-            deaths.append(f"environment {index} ({_cause(process.exitcode)})")
-    return ", ".join(deaths)
+    if not first:
+        # A pipe may be closed a moment before its process is gone.
+        ended = connection.wait([process.sentinel for process in env.processes], timeout=1.0)
+        first = [i for i, process in enumerate(env.processes) if process.sentinel in ended]
+    for index in first:
+        env.processes[index].join(timeout=1.0)
+    causes = (_cause(env.processes[index].exitcode) for index in first)
+    return ", ".join(f"environment {i} ({cause})" for i, cause in zip(first, causes, strict=True))
 
 
 def _cause(exitcode: int | None) -> str:
@@ -72,8 +97,7 @@ def _cause(exitcode: int | None) -> str:
     return f"exit code {exitcode}"
 
 
-def _end_all(env: VecEnv) -> None:
-    assert isinstance(env, SubprocVecEnv)
+def _end_all(env: SubprocVecEnv) -> None:
     for process in env.processes:
         process.terminate()
     for process, remote in zip(env.processes, env.remotes, strict=True):

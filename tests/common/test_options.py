@@ -10,7 +10,7 @@ from stable_baselines3 import PPO
 from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from tests.helpers import SMALL
+from tests.helpers import SMALL, learned
 
 OWN_OPTIONS: dict[type[Any], dict[str, Any]] = {
     PolicyFlow: {"n_flow_steps": 3, "interpolant": "trigflow", "latent_std": 0.5},
@@ -112,10 +112,34 @@ def test_former_names_when_loading(tmp_path: Path) -> None:
     assert loaded.lr_adaptation_kwargs == {"factor": 1.25}
 
 
+def test_a_former_name_that_is_also_a_parameter_of_load(tmp_path: Path) -> None:
+    """``path`` is the file where it alone is given, and an option beside a file."""
+    with pytest.warns(DeprecationWarning, match="path is now interpolant"):
+        model = PolicyFlow("MlpPolicy", "Pendulum-v1", path="trigflow", **SMALL)
+    model.save(tmp_path / "model")
+    options: dict[str, Any] = {**SMALL, "path": "rectified"}
+    assert PolicyFlow.load(tmp_path / "model", **options).policy.interpolant == "rectified"
+    env = model.get_env()
+    loaded = PolicyFlow.load(str(tmp_path / "model"), env, **options)
+    assert loaded.policy.interpolant == "rectified"
+    assert loaded.learn(16).num_timesteps == 16
+    assert PolicyFlow.load(path=tmp_path / "model", env=env).policy.interpolant == "trigflow"
+    assert next(iter(inspect.signature(PolicyFlow.load).parameters)) == "path"
+
+
+@of_every_policy
+def test_load_needs_one_file(algorithm: type[Any], tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'path'"):
+        algorithm.load()
+    if algorithm is not PolicyFlow:
+        with pytest.raises(TypeError, match="multiple values for argument 'path'"):
+            algorithm.load(tmp_path / "model", path=tmp_path / "model")
+
+
 def test_former_names_of_policies() -> None:
     with pytest.warns(DeprecationWarning, match="initialisation is now initialization"):
         model = FPO("MlpPolicy", "Pendulum-v1", policy_kwargs={"initialisation": "zero"}, **SMALL)
-    assert not any(parameter.any() for parameter in model.policy.velocity.parameters())
+    assert not any(parameter.any() for parameter in learned(model.policy.velocity))
     with pytest.warns(DeprecationWarning, match="path is now interpolant"):
         policy = PolicyFlow.policy_aliases["MlpPolicy"](
             model.observation_space,

@@ -65,7 +65,7 @@ def test_chunks_cover_all_rows_in_order(n: int) -> None:
         sizes.append(len(part["pair"][0]))
         return th.stack([part["record"].latents, part["pair"][0].float()], dim=1)
 
-    found = in_chunks(total, tree(n))
+    found = in_chunks(total, tree(n), batch_size=64)
     assert sum(sizes) == n
     assert (len(sizes) > 1) == (n == 20_000)
     assert th.equal(found, th.arange(n).float().unsqueeze(1).expand(n, 2))
@@ -73,4 +73,4 @@ def test_chunks_cover_all_rows_in_order(n: int) -> None:
 
 def test_chunks_are_evaluated_without_gradients() -> None:
     weight = th.ones((), requires_grad=True)
-    assert not in_chunks(lambda x: weight * x, th.ones(3)).requires_grad
+    assert not in_chunks(lambda x: weight * x, th.ones(3), batch_size=2).requires_grad

@@ -11,6 +11,7 @@ from torch import nn
 from sb3_policyflow.flows import SOLVERS
 from sb3_policyflow.kernels.activations import Activation
 from sb3_policyflow.kernels.inspection import ModuleInspector
+from tests.helpers import learned
 from tests.kernels.plain import (
     ACTIVATIONS,
     SHAPES,
@@ -118,7 +119,7 @@ def gradients(field: nn.Module, inputs: list[th.Tensor], weights: th.Tensor) -> 
         for tensor, needs in zip(inputs, (True, False, True), strict=True)
     )
     velocity = field(points, times, features)
-    leaves = [*field.parameters(), points, features]
+    leaves = [*learned(field), points, features]
     return [velocity, *th.autograd.grad((velocity * weights).sum(), leaves)]
 
 
@@ -208,6 +209,21 @@ def test_derivatives_of_derivatives_of_a_critic() -> None:
         second.append(th.autograd.grad(slope.square().sum(), [x, *critic.plain[:2:2].parameters()]))
     for ours, theirs in zip(*second, strict=True):
         close(ours, theirs, ulps=400)
+
+
+def test_derivatives_of_derivatives_are_those_of_the_weights_then() -> None:
+    """Even if the parameters have been replaced before the backward pass."""
+    field = make_field(2, 3, [8])
+    plain = plain_copy(field)
+    x, t, s = th.randn(4, 2), th.rand(4), th.randn(4, 3)
+    second = []
+    for net in (field, plain):
+        points = x.clone().requires_grad_()
+        velocity = net(points, t, s)
+        net.hidden[0] = nn.Linear(66, 8)
+        (slope,) = th.autograd.grad(velocity.square().sum(), points, create_graph=True)
+        second.append(th.autograd.grad(slope.square().sum(), points)[0])
+    close(*second, ulps=400)
 
 
 def test_weights_changed_between_the_two_ways_are_noticed() -> None:

@@ -16,6 +16,7 @@ from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.flows import integrate
 from sb3_policyflow.kernels.compiler import note_fallback
 from sb3_policyflow.kernels.fields import KernelVelocityField
+from tests.helpers import learned
 from tests.kernels.plain import integrate_plainly, make_field, plain_copy
 
 OPTIONS: dict[str, Any] = {"solver": "midpoint", "n_steps": 4, "end_time": 1.0}
@@ -52,8 +53,8 @@ def test_gradients_through_the_flow() -> None:
     ours = field.integrate(z, s, **OPTIONS).square().sum()
     theirs = integrate(lambda x, t: plain(x, t, s), z, **OPTIONS).square().sum()
     for gradient, expected in zip(
-        th.autograd.grad(ours, list(field.parameters())),
-        th.autograd.grad(theirs, list(plain.parameters())),
+        th.autograd.grad(ours, learned(field)),
+        th.autograd.grad(theirs, learned(plain)),
         strict=True,
     ):
         th.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5)

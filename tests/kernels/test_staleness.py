@@ -68,7 +68,8 @@ def change_time(field: Any) -> None:
 
 
 def change_frequencies(field: Any) -> None:
-    field.time_embedding.frequencies = 2 * field.time_embedding.frequencies
+    doubled = 2 * field.time_embedding.frequencies
+    field.time_embedding.frequencies = nn.Parameter(doubled, requires_grad=False)
 
 
 def change_frequencies_in_place(field: Any) -> None:

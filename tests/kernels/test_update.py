@@ -12,10 +12,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
-from sb3_policyflow.common.update import UpdateMetrics
+from sb3_policyflow.common.update import UpdateMetrics, clip_gradients, make_optimizer
 from sb3_policyflow.kernels.compiler import SWITCH, load_kernels
 from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
+from tests.helpers import learned
 from tests.kernels.plain import Critic, make_field
 from tests.resilience.test_collection import Clock
 
@@ -80,7 +80,7 @@ def test_features_extractors(policy: str, request: pytest.FixtureRequest) -> Non
         loss = update.surrogate_loss(terms.log_ratio, rollout.advantages, UpdateMetrics())
         values = model.policy.values(critic_features).flatten()
         loss = loss + terms.regularizer + (values - rollout.returns).square().mean()
-        return list(th.autograd.grad(loss, list(model.policy.parameters())))
+        return list(th.autograd.grad(loss, learned(model.policy)))
 
     fused = gradients()
     request.getfixturevalue("no_kernels")

@@ -13,7 +13,7 @@ from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import clipped_surrogate
 from sb3_policyflow.policyflow.policies import PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import PathSamples, PolicyFlowUpdate
-from tests.helpers import perturb
+from tests.helpers import learned, perturb
 
 N_SAMPLES = 16
 
@@ -146,7 +146,7 @@ def test_equals_gaussian_ppo_when_the_reference_velocity_and_the_latents_are_zer
 
 
 def actor_parameters(model: PolicyFlow) -> list[nn.Parameter]:
-    return [*model.policy.velocity.parameters(), model.policy.log_std]
+    return [*learned(model.policy.velocity), model.policy.log_std]
 
 
 @pytest.mark.parametrize("interpolant", ["rectified", "stochastic", "trigflow"])

@@ -135,6 +135,18 @@ def test_files_without_random_states_load(tmp_path: Path) -> None:
     assert drawn_in_learning(loaded) != expected
 
 
+def test_a_seed_that_is_set_after_loading_counts(tmp_path: Path) -> None:
+    env = make_vec_env("Pendulum-v1", 1)
+    PolicyFlow("MlpPolicy", env, **SMALL).learn(16).save(tmp_path / "model")
+    runs = []
+    for seed in (1, 1, 2):
+        loaded = PolicyFlow.load(tmp_path / "model", env=env)
+        loaded.set_random_seed(seed)
+        runs.append(weights(loaded.learn(16)))
+    assert th.equal(runs[0], runs[1])
+    assert not th.equal(runs[0], runs[2])
+
+
 def test_going_on_in_the_middle_of_episodes(tmp_path: Path) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 2))
     model = PolicyFlow("MlpPolicy", env, **SMALL).learn(64)

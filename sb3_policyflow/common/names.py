@@ -1,0 +1,142 @@
+"""Names of arguments and methods: former ones, SB3's that have no meaning here, misspelt ones."""
+
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from difflib import get_close_matches
+from typing import Any
+
+from stable_baselines3.common.policies import BasePolicy
+
+FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
+"""Present values of options by option and former value."""
+
+OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
+FOREIGN_ARGUMENTS = {
+    "full_std": OF_GSDE,
+    "use_expln": OF_GSDE,
+    "squash_output": (
+        "it belongs to gSDE, which flow policies do not support. Leave it out: actions are clipped "
+        "to their bounds, to which DPPO with process='ddpm' scales them."
+    ),
+    "log_std_init": (
+        "only PolicyFlow has Gaussian noise that is learned; FPO and DPPO have options of their "
+        "own for the noise of their actions."
+    ),
+}
+"""Arguments of SB3's actor-critic policies that some or all flow policies do not have, and why."""
+
+NOT_CALLED = {
+    "_get_action_dist_from_latent": (
+        "a flow policy has no distribution with a likelihood: override sample_actions, or "
+        "_build_actor for another velocity field"
+    ),
+    "reset_noise": "flow policies do not support gSDE: override sample_actions",
+}
+"""Methods of SB3's policies that nothing would ever call, and what to override instead."""
+
+NOT_CALLED_BY_TRAINING = ("evaluate_actions", "get_distribution")
+"""Methods of SB3's policies that PPO trains with, and flow algorithms do not."""
+
+
+def check_overridden_methods(policy_class: type[Any], base: type[Any]) -> None:
+    """Refuse a policy class with methods that nothing calls, and warn of those that seldom are.
+
+    :param policy_class: The class.
+    :param base: The base of all flow policies.
+    :raises TypeError: With the method to override instead.
+    """
+
+    def overrides(name: str) -> bool:
+        return getattr(policy_class, name) is not getattr(base, name)
+
+    for name, instead in NOT_CALLED.items():
+        if overrides(name):
+            raise TypeError(f"{policy_class.__name__} overrides {name}, but {instead}.")
+    for name in filter(overrides, NOT_CALLED_BY_TRAINING):
+        warnings.warn(
+            f"{policy_class.__name__} overrides {name}, which the flow algorithms do not call: "
+            "what they train on is in the terms of their update_class.",
+            stacklevel=4,
+        )
+
+
+def unknown_argument(
+    owner: str, name: str, own: Collection[str], of_policy: Collection[str] = ()
+) -> TypeError:
+    """An error that says where an argument that does not exist belongs.
+
+    :param owner: Who does not have it.
+    :param name: The argument.
+    :param own: Names of the arguments that the owner has.
+    :param of_policy: Names of those of the owner's policy, if that is another.
+    """
+    if name in of_policy:
+        return TypeError(
+            f"{name} is an option of {owner}'s policy: give it in policy_kwargs, as "
+            f"{owner}(..., policy_kwargs=dict({name}=...))."
+        )
+    if name in FOREIGN_ARGUMENTS:
+        return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
+    similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
+    places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
+    meant = f"did you mean {_either(places)}?" if places else f"help({owner}) shows those it has."
+    return TypeError(f"{owner} has no argument {name!r}: {meant}")
+
+
+def _either(names: Iterable[str]) -> str:
+    """The names in a sentence.
+
+    >>> _either(["a", "b", "c"])
+    'a, b or c'
+    """
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def with_present_names(
+    options: Mapping[str, Any], former_names: Mapping[str, str], warn: bool = True
+) -> dict[str, Any]:
+    """Options under their present names; where one has changed, a ``DeprecationWarning``.
+
+    >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
+    {'size': 2, 'rule_kwargs': {'factor': 3}}
+
+    :param options: Options by name, former or present.
+    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
+        become a key of another one.
+    :param warn: Whether to warn. Options that come from a file are nobody's mistake.
+    """
+    present = {name: value for name, value in options.items() if name not in former_names}
+    for former in former_names.keys() & options.keys():
+        name, _, key = former_names[former].partition(".")
+        present[name] = (
+            {**(present.get(name) or {}), key: options[former]} if key else options[former]
+        )
+        _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
+    for name, former in _former_values(present):
+        present[name] = FORMER_VALUES[name, former]
+        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
+    return present
+
+
+def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
+
+
+def _warn_if(warn: bool, change: str) -> None:
+    if warn:
+        warnings.warn(f"{change}: use the new name.", DeprecationWarning, stacklevel=4)
+
+
+def policy_aliases(
+    mlp: type[BasePolicy], cnn: type[BasePolicy], multi_input: type[BasePolicy]
+) -> dict[str, type[BasePolicy]]:
+    """An algorithm's policies by the names of flow policies and by those of SB3."""
+    return {
+        "MlpFlowPolicy": mlp,
+        "CnnFlowPolicy": cnn,
+        "MultiInputFlowPolicy": multi_input,
+        "MlpPolicy": mlp,
+        "CnnPolicy": cnn,
+        "MultiInputPolicy": multi_input,
+    }
