@@ -6,8 +6,10 @@ from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow.common import checks, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
@@ -57,6 +59,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     trust_region: str = "ppo"
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
+    _learning_rates: tuple[Any, Schedule]
+    """The ``learning_rate`` and the ``lr_schedule`` that was made of it."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -166,11 +170,34 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         schedule = parse_schedule(name, getattr(self, name))
         return float(schedule(self._current_progress_remaining))
 
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Collect one rollout; see :meth:`ResilientOnPolicyAlgorithm.collect_rollouts`."""
+        options.take_up_changes(self)
+        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
         # The last rollout may end beyond total_timesteps, where SB3's value is negative and a
         # linear schedule with it: a negative learning rate would ascend the loss.
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        self._learning_rates = self.learning_rate, self.lr_schedule
+
+    def read_learning_rate(self) -> None:
+        """Take up a ``learning_rate`` or ``lr_schedule`` that has been set."""
+        learning_rate, schedule = self._learning_rates
+        if self.lr_schedule is not schedule:
+            self.learning_rate = self.lr_schedule
+        if self.learning_rate is not learning_rate:
+            self._setup_lr_schedule()
 
     def _start_adaptive_learning_rate(self) -> None:
         """Start with ``learning_rate``, unless a run continues that started with it."""
@@ -205,6 +232,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
+        options.take_up_changes(self)
         rollout = self.rollout_buffer.samples()
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
@@ -294,9 +322,13 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_learning_rates"]
+
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
         options.note_changed_options(self)
+        self.read_learning_rate()
         super().save(path, exclude, include)
 
     def learn(

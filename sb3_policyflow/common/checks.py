@@ -219,18 +219,24 @@ def choose_buffer_class(
     return given
 
 
-def check_batches(batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool) -> None:
-    """Refuse sizes that SB3's PPO refuses, and warn of those it warns of.
+def check_batch_size(
+    batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool
+) -> None:
+    """Refuse sizes that SB3's PPO refuses.
 
     :raises ValueError: If advantages would be normalized over one sample.
     """
-    buffer_size = n_steps * n_envs
     at_least(2 if normalize_advantage else 1)("batch_size", batch_size)
-    if normalize_advantage and buffer_size < 2:
+    if normalize_advantage and n_steps * n_envs < 2:
         raise ValueError(
             "Advantages cannot be normalized over one sample: n_steps * n_envs must be greater "
             f"than 1, got n_steps={n_steps} and n_envs={n_envs}."
         )
+
+
+def warn_of_batches(batch_size: int, n_steps: int, n_envs: int) -> None:
+    """Warn of sizes that SB3's PPO warns of."""
+    buffer_size = n_steps * n_envs
     if buffer_size % batch_size > 0:
         warnings.warn(
             f"batch_size={batch_size} does not divide n_steps * n_envs = {n_steps} * {n_envs} = "

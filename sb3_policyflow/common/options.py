@@ -284,8 +284,20 @@ def check_algorithm(model: Any) -> None:
                 f"{option} is an option of the algorithm and not of its policy: take it out of "
                 f"policy_kwargs, as {name}(..., {option}=...)."
             )
+    check_values(model)
+    checks.warn_of_batches(model.batch_size, model.n_steps, model.n_envs)
+
+
+def check_values(model: Any) -> None:
+    """Refuse values that cannot be used, however they came to be the model's.
+
+    :param model: An algorithm.
+    :raises ValueError: With what to use instead.
+    """
     checks.check_options(model)
-    checks.check_batches(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
+    checks.check_batch_size(
+        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
+    )
     if model.desired_kl is None:
         return
     if model.value_of("desired_kl") == 0:
@@ -296,3 +308,20 @@ def check_algorithm(model: Any) -> None:
             "With desired_kl the learning rate follows the divergence of the policy: give the "
             "learning_rate that it starts with, not a schedule."
         )
+
+
+def take_up_changes(model: Any) -> None:
+    """Let attributes that have been set since the last time have their effect.
+
+    :param model: An algorithm that is about to collect a rollout, or to learn from it.
+    :raises ValueError: If a value cannot be used, or cannot change.
+    """
+    check_values(model)
+    buffer = model.rollout_buffer
+    if model.n_steps != buffer.buffer_size:
+        raise ValueError(
+            f"n_steps cannot change, because the rollout buffer has {buffer.buffer_size} steps: "
+            f"save the model and load it with load(file, n_steps={model.n_steps}), or make another."
+        )
+    buffer.gamma, buffer.gae_lambda = model.gamma, model.gae_lambda
+    model.read_learning_rate()

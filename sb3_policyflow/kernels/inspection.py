@@ -201,16 +201,16 @@ def why_torch_must_work() -> str | None:
     return None
 
 
-def has_values() -> bool:
-    """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
-    is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
-    return not is_traced and th._C._functorch.peek_interpreter_stack() is None
-
-
 def _is_watched() -> bool:
     """Whether torch's functions have a mode; that of the default device changes no tensor."""
     modes = range(th._C._len_torch_function_stack())
     return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
+
+
+def has_values() -> bool:
+    """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
+    is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None
+    return not is_traced and th._C._functorch.peek_interpreter_stack() is None
 
 
 def are_usable(tensors: Iterable[th.Tensor]) -> bool:
