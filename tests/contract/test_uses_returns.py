@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -43,6 +44,50 @@ def test_kinds_of_terminal_observations(any_algorithm: type[Any], terminal: Any)
         return
     make(any_algorithm, env).learn(32, seen)
     np.testing.assert_allclose(seen.stored, np.array(seen.expected), atol=1e-5)
+
+
+class Endless(Simulator):
+    """Without time limits, which let PPO take more kinds of arrays.
+
+    :param change: Makes what ``step`` returns of it.
+    """
+
+    def __init__(self, change: Any) -> None:
+        super().__init__(2)
+        self.change = change
+
+    def step_wait(self) -> Any:
+        obs, rewards, dones, _ = super().step_wait()
+        return self.change(obs, rewards, dones, [{}, {}])
+
+
+KINDS: dict[str, Any] = {
+    "list": lambda obs, rewards, *rest: (obs, rewards.tolist(), *rest),
+    "tuple": lambda obs, rewards, *rest: (obs, tuple(rewards), *rest),
+    "tensor": lambda obs, rewards, *rest: (obs, th.as_tensor(rewards), *rest),
+    "object": lambda obs, rewards, *rest: (obs, rewards.astype(object), *rest),
+    "masked": lambda obs, rewards, *rest: (obs, np.ma.array(rewards), *rest),
+    "view": lambda obs, rewards, *rest: (obs, rewards[::-1][::-1], *rest),
+    "read-only dones": lambda o, r, dones, i: (o, r, np.broadcast_to(dones[0], (2,)), i),
+    "array of infos": lambda o, r, d, infos: (o, r, d, np.array(infos, dtype=object)),
+    "float64": lambda obs, *rest: (obs.astype(np.float64), *rest),
+    "float16": lambda obs, *rest: (obs.astype(np.float16), *rest),
+    "fortran": lambda obs, *rest: (np.asfortranarray(obs), *rest),
+    "matrix": lambda obs, *rest: (np.asmatrix(obs), *rest),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_other_kinds_that_ppo_takes(any_algorithm: type[Any], kind: str) -> None:
+    model = make(any_algorithm, Endless(KINDS[kind])).learn(32)
+    expected = np.arange(1, 17)[:, None] % 7 + np.arange(2)
+    np.testing.assert_array_equal(model.rollout_buffer.rewards, expected)
+
+
+def test_observations_that_are_lists_are_named(any_algorithm: type[Any]) -> None:
+    env = Endless(lambda obs, *rest: (obs.tolist(), *rest))
+    with pytest.raises(TypeError, match="Unrecognized type of observation"):
+        make(any_algorithm, env).learn(32)
 
 
 class OwnMemory(Simulator):

@@ -129,6 +129,50 @@ def test_callback_that_returns_false(any_algorithm: type[Any], stop_at: int) -> 
     assert model._n_updates == (1 if stop_at == 17 else 0)
 
 
+ROW = np.array([0.1, 0.2, 0.3], np.float32)
+
+
+class AtRolloutEnd(BaseCallback):
+    """Calls a function with the model when a rollout is complete."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__()
+        self.function = function
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.function(self.model)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda model: next(model.rollout_buffer.get(4)),
+        lambda model: list(model.rollout_buffer.get()),
+        lambda model: model.rollout_buffer.sample(4),
+        lambda model: model.rollout_buffer.compute_returns_and_advantage(
+            th.zeros(1), np.zeros(1)
+        ),
+        lambda model: model.rollout_buffer.advantages.__imul__(2.0),
+        lambda model: model.train(),
+        lambda model: model.env.reset(),
+        lambda model: model.logger.dump(1),
+        lambda model: model.predict(ROW),
+        lambda model: model.policy.train(),
+        lambda model: model.policy.optimizer.zero_grad(),
+    ],
+    ids=["get", "get_all", "sample", "returns", "scale", "train", "reset", "dump", "predict",
+         "mode", "zero_grad"],
+)  # fmt: skip
+def test_what_callbacks_do_with_a_rollout(any_algorithm: type[Any], function: Any) -> None:
+    model = make(any_algorithm)
+    before = weights(model)
+    assert_trained(model.learn(48, AtRolloutEnd(function)), before)
+    assert model.num_timesteps == 48
+
+
 # Runs that are broken off, and those of unusual length
 
 

@@ -133,8 +133,9 @@ def test_copies_train_as_their_originals(any_algorithm: type[Any], kind: str) ->
         np.random.seed(3)
         runs.append(weights(one.learn(32)))
     assert th.equal(*runs)
+    expected = actions(model)
     policy = COPIES[kind](model.policy)
-    np.testing.assert_array_equal(policy.predict(SEEN, deterministic=True)[0], actions(model))
+    np.testing.assert_array_equal(policy.predict(SEEN, deterministic=True)[0], expected)
 
 
 def _answer(model: Any, queue: Any) -> None:
