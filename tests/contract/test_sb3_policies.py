@@ -47,7 +47,7 @@ POLICY_ARGUMENTS: dict[str, tuple[Any, str | Callable[[Any], bool]]] = {
     "activation_fn": (nn.ReLU, lambda p: type(p.mlp_extractor.value_net[1]) is nn.ReLU),
     "ortho_init": (False, lambda p: bool(p.value_net.bias.any())),
     "use_sde": (True, "use_sde is an option of the algorithm"),
-    "log_std_init": (-1.0, "log_std_init: only PolicyFlow .* action_noise_std.* min_sampling_std"),
+    "log_std_init": (-1.0, "has no log_std_init: only PolicyFlow"),
     "full_std": (False, "full_std: it belongs to gSDE"),
     "use_expln": (True, "use_expln: it belongs to gSDE"),
     "squash_output": (True, "squash_output: it belongs to gSDE.* process='ddpm'"),
