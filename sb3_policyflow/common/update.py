@@ -110,17 +110,24 @@ class UpdateMetrics:
     def add_means(self, metrics: Mapping[str, th.Tensor]) -> None:
         """Add metrics of one minibatch, tensors without dimensions, that are averaged."""
         for name, value in metrics.items():
-            self._to_average.setdefault(name, []).append(value.detach())
+            self._append(self._to_average.setdefault(name, []), value)
 
     def add_maxima(self, metrics: Mapping[str, th.Tensor]) -> None:
         """Add metrics of one minibatch of which the greatest counts."""
         for name, value in metrics.items():
-            self._to_maximize.setdefault(name, []).append(value.detach())
+            self._append(self._to_maximize.setdefault(name, []), value)
+
+    @staticmethod
+    def _append(values: list[th.Tensor], value: th.Tensor) -> None:
+        values.append(value.detach())
+        if len(values) == 32:
+            # Many small tensors would keep the memory between them from being used again.
+            values[:] = [th.hstack(values)]
 
     def summary(self) -> dict[str, float]:
         """Each metric over all minibatches."""
-        reduced = {name: th.stack(values).mean() for name, values in self._to_average.items()}
-        reduced |= {name: th.stack(values).max() for name, values in self._to_maximize.items()}
+        reduced = {name: th.hstack(values).mean() for name, values in self._to_average.items()}
+        reduced |= {name: th.hstack(values).max() for name, values in self._to_maximize.items()}
         if not reduced:
             return {}
         return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))

@@ -53,3 +53,12 @@ def test_numbers_that_are_not_finite_are_not_hidden(number: float) -> None:
         metrics.add_maxima({"max": th.tensor(value)})
     for value in metrics.summary().values():
         assert value == pytest.approx(number, nan_ok=True)
+
+
+def test_metrics_of_many_minibatches_are_all_counted() -> None:
+    metrics, values = UpdateMetrics(), th.rand(101)
+    for value in values:
+        metrics.add_means({"loss": value})
+        metrics.add_maxima({"largest": value})
+    found = metrics.summary()
+    assert found == {"loss": values.mean().item(), "largest": values.max().item()}
