@@ -219,9 +219,7 @@ def choose_buffer_class(
     return given
 
 
-def check_batch_size(
-    batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool
-) -> None:
+def check_batch_size(batch_size: int, n_steps: int, n_envs: int, normalize_advantage: bool) -> None:
     """Refuse sizes that SB3's PPO refuses.
 
     :raises ValueError: If advantages would be normalized over one sample.

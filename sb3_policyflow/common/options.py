@@ -203,10 +203,7 @@ class PolicyOption:
     def __set__(self, model: Any, value: object) -> None:
         policy, name = model.policy, self._name
         if name in policy.fixed_options:
-            raise AttributeError(
-                f"{name} cannot change, because the policy was made with it: save the model and "
-                f"load it with load(file, {name}={value!r}), or make another one."
-            )
+            raise AttributeError(_cannot_change(name, value, "the policy was made with another"))
         former = getattr(policy, name)
         setattr(policy, name, value)
         try:
@@ -241,16 +238,27 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
     return extend
 
 
+def _cannot_change(name: str, value: object, because: str) -> str:
+    return (
+        f"{name} cannot change, because {because}: save the model and load it with "
+        f"load(file, {name}={value!r}), or make another one."
+    )
+
+
 def note_changed_options(model: Any) -> None:
     """Take up into ``policy_options`` what has been changed on the policy itself.
 
-    :param model: An algorithm that is about to be saved.
+    :param model: An algorithm that is about to be saved, or to go on.
+    :raises ValueError: If an option has changed that cannot.
     """
     given = {**model.policy_kwargs, **model.policy_options}
     for option in own_options(model.policy_base):
-        value = getattr(model.policy, option.name)
-        if value != given.get(option.name, option.default):
-            model.policy_options[option.name] = value
+        name, value = option.name, getattr(model.policy, option.name)
+        if value == given.get(name, option.default):
+            continue
+        if name in model.policy.fixed_options:
+            raise ValueError(_cannot_change(name, value, "the policy was made with another"))
+        model.policy_options[name] = value
 
 
 def read_loaded_options(model: Any) -> None:
@@ -317,11 +325,10 @@ def take_up_changes(model: Any) -> None:
     :raises ValueError: If a value cannot be used, or cannot change.
     """
     check_values(model)
+    note_changed_options(model)
     buffer = model.rollout_buffer
     if model.n_steps != buffer.buffer_size:
-        raise ValueError(
-            f"n_steps cannot change, because the rollout buffer has {buffer.buffer_size} steps: "
-            f"save the model and load it with load(file, n_steps={model.n_steps}), or make another."
-        )
+        because = f"the rollout buffer has {buffer.buffer_size} steps"
+        raise ValueError(_cannot_change("n_steps", model.n_steps, because))
     buffer.gamma, buffer.gae_lambda = model.gamma, model.gae_lambda
     model.read_learning_rate()

@@ -49,7 +49,7 @@ class Flow(NamedTuple):
     def times(self) -> th.Tensor:
         """The solver's time grid on the device of the field (paper: the discrete time grid)."""
         times = solver_times(self.solver, self.n_steps, self.interpolant.end_time)
-        return times.to(self.velocity.output.weight)
+        return times.to(self.velocity.time_embedding.frequencies)
 
     @property
     def n_evaluations(self) -> int:

@@ -75,7 +75,7 @@ def fold(field: "VelocityField", times: th.Tensor) -> FoldedLayer:
     assert isinstance(first, nn.Linear)
     observation = field.observation_embedding
     embeddings = field.time_embedding(times) + observation.bias
-    dim = field.output.out_features
+    dim = first.in_features - observation.out_features
     return split_first_layer(dim, first.weight, first.bias, observation.weight, embeddings)
 
 

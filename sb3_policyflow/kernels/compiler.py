@@ -3,7 +3,7 @@
 import logging
 import os
 from functools import cache
-from typing import Any
+from typing import cast
 
 from sb3_policyflow.kernels.layouts import Kernels
 
@@ -30,8 +30,7 @@ def load_kernels() -> Kernels | str:
             f"numba cannot be used ({error}); if it has no folder for what it compiles, name one "
             "in the environment variable NUMBA_CACHE_DIR"
         )
-    kernels: Any = _numba
-    return kernels  # type: ignore[no-any-return]
+    return cast("Kernels", _numba)
 
 
 @cache

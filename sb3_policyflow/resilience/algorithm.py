@@ -38,8 +38,9 @@ def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(load)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
-        cls, *file = args
-        present = cls.former_names.get("path") if file and "path" in kwargs else None  # type: ignore[attr-defined]  # a class
+        cls: Any = args[0]
+        is_positional = len(args) > 1 and "path" in kwargs
+        present = cls.former_names.get("path") if is_positional else None
         if present is not None:
             kwargs[present] = kwargs.pop("path")
         return load(*args, **kwargs)

@@ -41,6 +41,7 @@ class StepChecks:
         :raises FloatingPointError: If one is not finite.
         """
         what = "The environment's reward"
+        rewards = np.asarray(rewards, dtype=np.float64)
         if self._normalize is not None and not np.isfinite(rewards).all():
             # It has spread one environment's number over all of them.
             check_finite(self._normalize.get_original_reward(), what, timestep, ADVICE)

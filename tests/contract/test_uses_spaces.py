@@ -135,13 +135,8 @@ def test_observations_as_lists(any_algorithm: type[Any], observe: Any) -> None:
 
 
 def test_observations_with_one_row(any_algorithm: type[Any]) -> None:
-    """Shape (1, 3) for a Box of shape (3,): PPO takes it, ours name it at the first time limit."""
-    model = make(any_algorithm, Returning(lambda: OBSERVED[None]))
-    if any_algorithm is PPO:
-        train(model)
-        return
-    with pytest.raises(ValueError, match="has shape"):
-        model.learn(48)
+    """Shape (1, 3) for a Box of shape (3,)."""
+    train(make(any_algorithm, Returning(lambda: OBSERVED[None])))
 
 
 def test_key_that_the_space_lacks(any_algorithm: type[Any]) -> None:
@@ -188,7 +183,7 @@ def test_empty_observations_are_refused(any_algorithm: type[Any]) -> None:
         make(any_algorithm, env)
 
 
-@pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
+@pytest.mark.parametrize("bound", [100.0, 1e10])
 def test_bounds_that_stand_for_none(any_algorithm: type[Any], bound: float) -> None:
     """Actions stay small enough to be used."""
     env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
@@ -198,11 +193,18 @@ def test_bounds_that_stand_for_none(any_algorithm: type[Any], bound: float) -> N
     assert np.abs(model.predict(np.tile(OBSERVED, (100, 1)))[0]).max() < 20
 
 
-@pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
+@pytest.mark.parametrize("bound", [100.0, 1e10])
 def test_dppo_warns_of_bounds_that_mean_nothing(bound: float) -> None:
     """It scales its actions to them."""
     env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
     with pytest.warns(UserWarning, match="bounds"):
+        make(DPPO, env)
+
+
+def test_dppo_refuses_bounds_that_it_cannot_scale_to() -> None:
+    bound = np.finfo(np.float32).max
+    env = Returning(lambda: OBSERVED, action_space=spaces.Box(-bound, bound, (2,)))
+    with pytest.raises(ValueError, match="use process='flow'"):
         make(DPPO, env)
 
 
@@ -253,9 +255,8 @@ def test_options_that_only_gaussian_policies_have(algorithm: type[Any], name: st
     if algorithm is PolicyFlow and name == "log_std_init":
         assert make(algorithm, policy_kwargs={name: value}).policy.log_std.mean() == value
         return
-    with pytest.raises((TypeError, ValueError), match=name) as caught:
+    with pytest.raises(TypeError, match=rf"has no {name}: .*flow polic|only PolicyFlow"):
         make(algorithm, policy_kwargs={name: value})
-    assert isinstance(caught.value, ValueError), "a bare TypeError of a constructor"
 
 
 class Networks(nn.Module):

@@ -251,7 +251,7 @@ class Tracked(BaseCallback):
             "hparams", HParam(values, names), exclude=("stdout", "log", "json", "csv")
         )
         self.norms: list[float] = []
-        for parameter in model.policy.parameters():
+        for parameter in filter(lambda p: p.requires_grad, model.policy.parameters()):
             parameter.register_hook(lambda gradient: self.norms.append(gradient.norm().item()))
 
     def _on_step(self) -> bool:

@@ -51,7 +51,7 @@ class Stopwatch:
         self._total.clear()
         model = self._model
         start = now(model)
-        model.learn(model.n_steps * model.n_envs, reset_num_timesteps=False, log_interval=None)  # type: ignore[arg-type]  # SB3 takes None
+        model.learn(model.n_steps * model.n_envs, reset_num_timesteps=False, log_interval=1_000_000)
         total = now(model) - start
         known = {part: self._total.get(part, 0.0) for part in PARTS if part != "other"}
         return {"total": total, **known, "other": total - sum(known.values())}
