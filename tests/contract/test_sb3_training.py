@@ -42,6 +42,7 @@ def make(algorithm: type[Any], env: Any = "Pendulum-v1", **options: Any) -> Any:
 # Callbacks
 
 
+@pytest.mark.slow
 def test_callbacks(algorithm: type[Any], tmp_path: Path) -> None:
     model = make(algorithm, IdentityEnvBox(-10, 10))
     evaluation = Monitor(IdentityEnvBox(-10, 10))
@@ -90,6 +91,7 @@ def test_stop_on_reward_threshold() -> None:
     assert model.num_timesteps == 40
 
 
+@pytest.mark.slow
 def test_eval_callback_vec_env(algorithm: type[Any]) -> None:
     env = make_vec_env(lambda: IdentityEnvBox(-10, 10), 2)
     model = make(algorithm, IdentityEnvBox(-10, 10))

@@ -178,6 +178,7 @@ def test_set_in_a_callback(any_algorithm: type[Any], name: str, value: Any) -> N
     assert th.equal(trained(new(any_algorithm), change), given(any_algorithm, **{name: value}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "name", "value"), OURS)
 def test_ours_set_after_construction(algorithm: type[Any], name: str, value: Any) -> None:
     """As if it had been given, or refused by a sentence; in no case without effect."""
@@ -199,6 +200,7 @@ def test_ours_set_to_what_is_not_allowed(algorithm: type[Any], name: str, value:
         assert unless_refused(model, name, "nonsense", lambda: model.learn(64)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("holder", ["model", "policy"])
 @pytest.mark.parametrize(("algorithm", "name", "value"), POLICIES)
 def test_options_of_the_policy_set_after_construction(
@@ -232,6 +234,7 @@ SAVED = [pytest.param(PPO, name, value, id=f"PPO-{name}") for name, value in OF_
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "name", "value"), SAVED)
 def test_saved_and_resumed(algorithm: type[Any], name: str, value: Any, tmp_path: Path) -> None:
     """A run that is resumed from a file goes on as the one that was not broken off.
