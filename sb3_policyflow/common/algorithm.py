@@ -1,26 +1,22 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
-import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv
+from typing_extensions import Self
 
 from sb3_policyflow.common import checks, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, clip_gradients
+from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
-
-SelfFlow = TypeVar("SelfFlow", bound="FlowOnPolicyAlgorithm")
 
 
 class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
@@ -49,18 +45,17 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
-    """Present names of options by former ones."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
+    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "_learning_rates")
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
 
     trust_region: str = "ppo"
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
-    _learning_rates: tuple[Any, Schedule]
-    """The ``learning_rate`` and the ``lr_schedule`` that was made of it."""
+    _learning_rates: tuple[Any, Schedule]  # the rate, and the schedule that was made of it
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -148,10 +143,12 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
         )
-        policy_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**policy_kwargs, **self.policy_options}
+        given, self.policy_kwargs = (
+            self.policy_kwargs,
+            {**self.policy_kwargs, **self.policy_options},
+        )
         super()._setup_model()
-        self.policy_kwargs = policy_kwargs
+        self.policy_kwargs = given
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
@@ -169,17 +166,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         """
         schedule = parse_schedule(name, getattr(self, name))
         return float(schedule(self._current_progress_remaining))
-
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: RolloutBuffer,
-        n_rollout_steps: int,
-    ) -> bool:
-        """Collect one rollout; see :meth:`ResilientOnPolicyAlgorithm.collect_rollouts`."""
-        options.take_up_changes(self)
-        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
@@ -211,6 +197,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _update_learning_rate(
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
+        options.take_up_changes(self)
         self._start_adaptive_learning_rate()
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)
@@ -232,12 +219,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
-        options.take_up_changes(self)
+        self._update_learning_rate(self.policy.optimizer)
         rollout = self.rollout_buffer.samples()
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
-        self._update_learning_rate(self.policy.optimizer)
         clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
@@ -292,38 +278,27 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
         th.autograd.backward(loss, inputs=trained)
-        clips = self.max_grad_norm is not None and self.max_grad_norm > 0
-        norm = clip_gradients(parameters, self.max_grad_norm if clips else math.inf)
-        if not (math.isfinite(norm) and th.isfinite(loss)):
-            what = "gradient" if th.isfinite(loss) else "loss"
-            raise FloatingPointError(
-                f"The {what} is not finite (loss {loss.item()}, {self.num_timesteps} timesteps). "
-                "The parameters are those of the last good step and can be saved: lower the "
-                f"learning rate{self.divergence_advice}."
-            )
+        norm = clip_gradients(parameters, self.max_grad_norm)
+        check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
         self.policy.optimizer.step()
         self.policy.keep_within_bounds()
 
     def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
-        reason = reason_kernels_are_off(self.policy) if self.n_rollouts == 1 else None
-        if reason is not None:
+        if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
             self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
         if hasattr(self.policy, "log_std"):
             logged["std"] = self.policy.log_std.exp().mean().item()
-        logged["clip_range"] = self.value_of("clip_range")
-        if self.clip_range_vf is not None:
-            logged["clip_range_vf"] = self.value_of("clip_range_vf")
+        for name in ("clip_range", "clip_range_vf"):
+            if getattr(self, name) is not None:
+                logged[name] = self.value_of(name)
         for name, value in {**metrics.summary(), **logged}.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_learning_rates"]
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
         """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
@@ -332,15 +307,16 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         super().save(path, exclude, include)
 
     def learn(
-        self: SelfFlow,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfFlow:
+    ) -> Self:
         """Train for ``total_timesteps``; see SB3. Runs are named after the class by default."""
+        options.take_up_changes(self)
         name = tb_log_name or type(self).__name__
         return super().learn(
             total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common.buffers import (
     DictFlowRolloutBuffer,
@@ -33,6 +34,26 @@ def check_options(options: object) -> None:
             check(name, getattr(options, name))
     for combined in getattr(options, "combination_checks", ()):
         combined(options)
+
+
+def check_values(model: Any) -> None:
+    """Refuse values that cannot be used, however they came to be the model's.
+
+    :param model: An algorithm.
+    :raises ValueError: With what to use instead.
+    """
+    check_options(model)
+    check_batch_size(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
+    if model.desired_kl is None:
+        return
+    if model.value_of("desired_kl") == 0:
+        raise ValueError(f"desired_kl must be positive or None, got {model.desired_kl}.")
+    learning_rate = FloatSchedule(model.learning_rate)
+    if learning_rate(1.0) != learning_rate(0.0):
+        raise ValueError(
+            "With desired_kl the learning rate follows the divergence of the policy: give the "
+            "learning_rate that it starts with, not a schedule."
+        )
 
 
 def one_of(choices: Collection[str]) -> Check:

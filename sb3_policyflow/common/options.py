@@ -9,7 +9,6 @@ from typing import Any, ParamSpec, TypedDict, cast
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.names import unknown_argument, with_present_names
@@ -292,39 +291,17 @@ def check_algorithm(model: Any) -> None:
                 f"{option} is an option of the algorithm and not of its policy: take it out of "
                 f"policy_kwargs, as {name}(..., {option}=...)."
             )
-    check_values(model)
+    checks.check_values(model)
     checks.warn_of_batches(model.batch_size, model.n_steps, model.n_envs)
-
-
-def check_values(model: Any) -> None:
-    """Refuse values that cannot be used, however they came to be the model's.
-
-    :param model: An algorithm.
-    :raises ValueError: With what to use instead.
-    """
-    checks.check_options(model)
-    checks.check_batch_size(
-        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
-    )
-    if model.desired_kl is None:
-        return
-    if model.value_of("desired_kl") == 0:
-        raise ValueError(f"desired_kl must be positive or None, got {model.desired_kl}.")
-    learning_rate = FloatSchedule(model.learning_rate)
-    if learning_rate(1.0) != learning_rate(0.0):
-        raise ValueError(
-            "With desired_kl the learning rate follows the divergence of the policy: give the "
-            "learning_rate that it starts with, not a schedule."
-        )
 
 
 def take_up_changes(model: Any) -> None:
     """Let attributes that have been set since the last time have their effect.
 
-    :param model: An algorithm that is about to collect a rollout, or to learn from it.
+    :param model: An algorithm that is about to learn: at all, or from a rollout.
     :raises ValueError: If a value cannot be used, or cannot change.
     """
-    check_values(model)
+    checks.check_values(model)
     note_changed_options(model)
     buffer = model.rollout_buffer
     if model.n_steps != buffer.buffer_size:

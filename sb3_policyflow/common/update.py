@@ -160,15 +160,16 @@ def make_optimizer(
     return optimizer_class(parameters, **arguments)
 
 
-def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math.inf) -> float:
+def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None = None) -> float:
     """Scale the gradients to a Euclidean norm of all together, if theirs is greater.
 
     Gradients that are not finite are left alone.
 
     :param parameters: Parameters, at least one with a gradient.
-    :param max_norm: The norm.
+    :param max_norm: The norm; no bound if None or not positive.
     :return: The norm that they had.
     """
+    max_norm = max_norm if max_norm is not None and max_norm > 0 else math.inf
     grads = [p.grad for p in parameters if p.grad is not None]
     norm = clip_gradients_in_place(grads, max_norm)
     if norm is not None:
@@ -178,3 +179,21 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float = math
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)
     return norm
+
+
+def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> None:
+    """Refuse a step of the optimizer that would spoil the parameters.
+
+    :param loss: The loss.
+    :param norm: Euclidean norm of its gradient.
+    :param num_timesteps: When, for the message.
+    :param advice: What helps besides a lower learning rate, for the message.
+    :raises FloatingPointError: If one of them is not finite.
+    """
+    if math.isfinite(loss) and math.isfinite(norm):
+        return
+    what = "gradient" if math.isfinite(loss) else "loss"
+    raise FloatingPointError(
+        f"The {what} is not finite (loss {loss}, {num_timesteps} timesteps). The parameters are "
+        f"those of the last good step and can be saved: lower the learning rate{advice}."
+    )

@@ -69,6 +69,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
+    unsaved: ClassVar[tuple[str, ...]] = ("_callback", "_step_checks", "_saved_random_states")
+    """Attributes that no file has."""
 
     _callback: BaseCallback | None = None
     """The callback of the rollout that is being collected; its ``locals`` are the loop's."""
@@ -187,12 +189,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             del self.resume_state
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            "_callback",
-            "_step_checks",
-            "_saved_random_states",
-        ]
+        return [*super()._excluded_save_params(), *self.unsaved]
 
     @classmethod
     @_takes_former_path
