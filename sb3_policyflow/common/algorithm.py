@@ -143,12 +143,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
         )
-        given, self.policy_kwargs = (
-            self.policy_kwargs,
-            {**self.policy_kwargs, **self.policy_options},
-        )
+        own, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self.policy_options}
         super()._setup_model()
-        self.policy_kwargs = given
+        self.policy_kwargs = own
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
