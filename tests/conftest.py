@@ -17,6 +17,8 @@ th.set_num_threads(1)
 def _seeded() -> None:
     th.manual_seed(0)
     np.random.seed(0)
+    # torch.export turns the checks of distributions off, for the rest of the process.
+    th.distributions.Distribution.set_default_validate_args(True)
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
 from typing_extensions import Self
 
-from sb3_policyflow.common import checks, options
+from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
@@ -48,10 +48,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
-    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "_learning_rates")
+    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
-
     trust_region: str = "ppo"
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
@@ -59,9 +58,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for option in options.own_options(cls.policy_base):
-            if not hasattr(cls, option.name):
-                setattr(cls, option.name, options.PolicyOption(option.name))
+        for name in names.settable_options(cls.policy_base):
+            if not hasattr(cls, name):
+                setattr(cls, name, options.PolicyOption(name))
 
     def __init__(
         self,
@@ -146,6 +145,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         own, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self.policy_options}
         super()._setup_model()
         self.policy_kwargs = own
+        self.known_policy_options = options.values_on_policy(self)
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)

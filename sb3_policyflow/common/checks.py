@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_policyflow.common.buffers import (
     DictFlowRolloutBuffer,
@@ -34,26 +33,6 @@ def check_options(options: object) -> None:
             check(name, getattr(options, name))
     for combined in getattr(options, "combination_checks", ()):
         combined(options)
-
-
-def check_values(model: Any) -> None:
-    """Refuse values that cannot be used, however they came to be the model's.
-
-    :param model: An algorithm.
-    :raises ValueError: With what to use instead.
-    """
-    check_options(model)
-    check_batch_size(model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage)
-    if model.desired_kl is None:
-        return
-    if model.value_of("desired_kl") == 0:
-        raise ValueError(f"desired_kl must be positive or None, got {model.desired_kl}.")
-    learning_rate = FloatSchedule(model.learning_rate)
-    if learning_rate(1.0) != learning_rate(0.0):
-        raise ValueError(
-            "With desired_kl the learning rate follows the divergence of the policy: give the "
-            "learning_rate that it starts with, not a schedule."
-        )
 
 
 def one_of(choices: Collection[str]) -> Check:
@@ -84,11 +63,9 @@ def at_least(lowest: int) -> Check:
 
 
 def between(lowest: float, highest: float = math.inf) -> Check:
-    """A number in a range, or a schedule, which is a function and passes."""
+    """A number in a range."""
 
     def check(name: str, value: object) -> None:
-        if callable(value):
-            return
         if not isinstance(value, Real) or not lowest <= float(value) <= highest:
             raise ValueError(f"{name} must be a number from {lowest} to {highest}, got {value!r}.")
 
@@ -128,8 +105,8 @@ def positive_up_to(highest: float) -> Check:
 
 
 def positive_or_none(name: str, value: object) -> None:
-    """A positive number, or None for no bound; schedules, which are functions, pass."""
-    if value is None or callable(value):
+    """A positive number, or None for no bound."""
+    if value is None:
         return
     if not isinstance(value, Real) or not float(value) > 0:
         raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
@@ -159,6 +136,16 @@ def or_none(check: Check) -> Check:
             check(name, value)
 
     return check_unless_none
+
+
+def or_schedule(check: Check) -> Check:
+    """What another check allows, or a schedule, which is a function."""
+
+    def check_unless_function(name: str, value: object) -> None:
+        if not callable(value):
+            check(name, value)
+
+    return check_unless_function
 
 
 def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any]) -> None:

@@ -1,5 +1,6 @@
 """Names of arguments and methods: former ones, SB3's that have no meaning here, misspelt ones."""
 
+import inspect
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import get_close_matches
@@ -60,6 +61,34 @@ def check_overridden_methods(policy_class: type[Any], base: type[Any]) -> None:
         )
 
 
+def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
+    """The keyword-only parameters of a policy's constructors, its own options."""
+    parameters = policy_parameters(policy_class).values()
+    return [parameter for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+
+
+def settable_options(policy_class: type[Any]) -> set[str]:
+    """Names of the options of a policy that are attributes of its algorithm too."""
+    return {"random_latents"} | {option.name for option in own_options(policy_class)}
+
+
+def policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
+    """What the constructors of a policy and of its bases take from ``policy_kwargs``."""
+    found: dict[str, inspect.Parameter] = {}
+    for cls in policy_class.__mro__:
+        if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
+            found |= named_parameters(inspect.signature(vars(cls)["__init__"]))
+    for name in ("self", "observation_space", "action_space", "lr_schedule", "use_sde"):
+        found.pop(name, None)
+    return found
+
+
+def named_parameters(signature: inspect.Signature) -> dict[str, inspect.Parameter]:
+    """The parameters that have names, without ``*args`` and ``**options``."""
+    collecting = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    return {name: p for name, p in signature.parameters.items() if p.kind not in collecting}
+
+
 def unknown_argument(
     owner: str, name: str, own: Collection[str], of_policy: Collection[str] = ()
 ) -> TypeError:
@@ -109,9 +138,10 @@ def with_present_names(
     present = {name: value for name, value in options.items() if name not in former_names}
     for former in former_names.keys() & options.keys():
         name, _, key = former_names[former].partition(".")
-        present[name] = (
-            {**(present.get(name) or {}), key: options[former]} if key else options[former]
-        )
+        if key:
+            present[name] = {**(present.get(name) or {}), key: options[former]}
+        else:
+            present.setdefault(name, options[former])
         _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
     for name, former in _former_values(present):
         present[name] = FORMER_VALUES[name, former]

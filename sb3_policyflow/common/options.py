@@ -11,8 +11,20 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.names import unknown_argument, with_present_names
-from sb3_policyflow.common.schedules import Coefficient, check_lr_adaptation, parse_schedule
+from sb3_policyflow.common.names import (
+    named_parameters,
+    own_options,
+    policy_parameters,
+    settable_options,
+    unknown_argument,
+    with_present_names,
+)
+from sb3_policyflow.common.schedules import (
+    Coefficient,
+    check_desired_kl,
+    check_lr_adaptation,
+    parse_schedule,
+)
 
 P = ParamSpec("P")
 
@@ -56,9 +68,9 @@ class FlowOptions(TypedDict, total=False):
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
-    "learning_rate": checks.between(0.0),
-    "clip_range": checks.between(0.0),
-    "clip_range_vf": checks.positive_or_none,
+    "learning_rate": checks.or_schedule(checks.between(0.0)),
+    "clip_range": checks.or_schedule(checks.between(0.0)),
+    "clip_range_vf": checks.or_schedule(checks.positive_or_none),
     "vf_coef": checks.between(0.0),
     "gamma": checks.between(0.0, 1.0),
     "gae_lambda": checks.between(0.0, 1.0),
@@ -130,19 +142,13 @@ def _complete_signature(
     policy_class: type[Any],
     defaults: Mapping[str, Any],
 ) -> inspect.Signature:
-    shared = _named(inspect.signature(base.__init__))
-    own = _named(inspect.signature(init))
+    shared = named_parameters(inspect.signature(base.__init__))
+    own = named_parameters(inspect.signature(init))
     for name, default in defaults.items():
         shared[name] = shared[name].replace(default=default)
     merged = {**shared, **own, **{option.name: option for option in own_options(policy_class)}}
     parameters = sorted(merged.values(), key=lambda parameter: parameter.kind)
     return inspect.Signature(parameters, return_annotation=None)
-
-
-def _named(signature: inspect.Signature) -> dict[str, inspect.Parameter]:
-    """The parameters that have names, without ``*args`` and ``**options``."""
-    collecting = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
-    return {name: p for name, p in signature.parameters.items() if p.kind not in collecting}
 
 
 def _check_names(
@@ -161,30 +167,13 @@ def _check_names(
         policy_class = policy
     own = signature.parameters.keys() - {"self"}
     for name in options.keys() - own:
-        of_policy = _policy_parameters(policy_class).keys() - own
+        of_policy = policy_parameters(policy_class).keys() - own
         raise unknown_argument(type(model).__name__, name, own, of_policy)
     if options.get("sde_sample_freq", -1) != -1:
         raise ValueError(
             f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
             "not support: leave it out."
         )
-
-
-def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
-    """The keyword-only parameters of a policy's constructors, its own options."""
-    parameters = _policy_parameters(policy_class).values()
-    return [parameter for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
-
-
-def _policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
-    """What the constructors of a policy and of its bases take from ``policy_kwargs``."""
-    found: dict[str, inspect.Parameter] = {}
-    for cls in policy_class.__mro__:
-        if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
-            found |= _named(inspect.signature(vars(cls)["__init__"]))
-    for name in ("self", "observation_space", "action_space", "lr_schedule", "use_sde"):
-        found.pop(name, None)
-    return found
 
 
 class PolicyOption:
@@ -202,7 +191,7 @@ class PolicyOption:
     def __set__(self, model: Any, value: object) -> None:
         policy, name = model.policy, self._name
         if name in policy.fixed_options:
-            raise AttributeError(_cannot_change(name, value, "the policy was made with another"))
+            raise AttributeError(_cannot_change(name))
         former = getattr(policy, name)
         setattr(policy, name, value)
         try:
@@ -229,7 +218,7 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
             present = with_present_names(options, former_names)
             for name in present.keys() - parameters.keys() if not hands_on else ():
                 owner = type(args[0])
-                raise unknown_argument(owner.__name__, name, _policy_parameters(owner))
+                raise unknown_argument(owner.__name__, name, policy_parameters(owner))
             cast("Callable[..., None]", init)(*args, **present)
 
         return extended
@@ -237,11 +226,9 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
     return extend
 
 
-def _cannot_change(name: str, value: object, because: str) -> str:
-    return (
-        f"{name} cannot change, because {because}: save the model and load it with "
-        f"load(file, {name}={value!r}), or make another one."
-    )
+def values_on_policy(model: Any) -> dict[str, Any]:
+    """The options of a model's policy that are attributes of the model too."""
+    return {name: getattr(model.policy, name) for name in settable_options(model.policy_base)}
 
 
 def note_changed_options(model: Any) -> None:
@@ -250,14 +237,17 @@ def note_changed_options(model: Any) -> None:
     :param model: An algorithm that is about to be saved, or to go on.
     :raises ValueError: If an option has changed that cannot.
     """
-    given = {**model.policy_kwargs, **model.policy_options}
-    for option in own_options(model.policy_base):
-        name, value = option.name, getattr(model.policy, option.name)
-        if value == given.get(name, option.default):
+    for name, value in values_on_policy(model).items():
+        known = model.known_policy_options[name]
+        if value == known:
             continue
         if name in model.policy.fixed_options:
-            raise ValueError(_cannot_change(name, value, "the policy was made with another"))
-        model.policy_options[name] = value
+            raise ValueError(f"Set {name} to {known!r} again. {_cannot_change(name)}")
+        model.policy_options[name] = model.known_policy_options[name] = value
+
+
+def _cannot_change(name: str) -> str:
+    return f"{name} cannot change, because the policy was made with it: make another model."
 
 
 def read_loaded_options(model: Any) -> None:
@@ -270,9 +260,8 @@ def read_loaded_options(model: Any) -> None:
     for former in model.former_names.keys() & attributes.keys():
         del attributes[former]
     attributes.update(present)
-    for option in own_options(model.policy_base):
-        if option.name in attributes:
-            model.policy_options[option.name] = attributes.pop(option.name)
+    for name in settable_options(model.policy_base) & attributes.keys():
+        model.policy_options[name] = attributes.pop(name)
 
 
 def check_algorithm(model: Any) -> None:
@@ -285,14 +274,28 @@ def check_algorithm(model: Any) -> None:
     checks.check_environment(name, model.env, space)
     checks.check_flow_spaces(model.action_space, model.use_sde)
     checks.check_policy_class(name, model.policy_class, model.policy_base)
-    for option in (model.policy_kwargs or {}).keys() - _policy_parameters(model.policy_class):
+    for option in (model.policy_kwargs or {}).keys() - policy_parameters(model.policy_class):
         if option in inspect.signature(type(model)).parameters:
             raise TypeError(
                 f"{option} is an option of the algorithm and not of its policy: take it out of "
                 f"policy_kwargs, as {name}(..., {option}=...)."
             )
-    checks.check_values(model)
+    check_values(model)
     checks.warn_of_batches(model.batch_size, model.n_steps, model.n_envs)
+
+
+def check_values(model: Any) -> None:
+    """Refuse values that cannot be used, however they came to be the model's.
+
+    :param model: An algorithm.
+    :raises ValueError: With what to use instead.
+    """
+    checks.check_options(model)
+    checks.check_batch_size(
+        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
+    )
+    if model.desired_kl is not None:
+        check_desired_kl(model.desired_kl, model.learning_rate)
 
 
 def take_up_changes(model: Any) -> None:
@@ -301,11 +304,10 @@ def take_up_changes(model: Any) -> None:
     :param model: An algorithm that is about to learn: at all, or from a rollout.
     :raises ValueError: If a value cannot be used, or cannot change.
     """
-    checks.check_values(model)
+    check_values(model)
     note_changed_options(model)
-    buffer = model.rollout_buffer
-    if model.n_steps != buffer.buffer_size:
-        because = f"the rollout buffer has {buffer.buffer_size} steps"
-        raise ValueError(_cannot_change("n_steps", model.n_steps, because))
-    buffer.gamma, buffer.gae_lambda = model.gamma, model.gae_lambda
+    for check in model.model_checks:
+        check(model)
+    model.rollout_buffer.gamma = model.gamma
+    model.rollout_buffer.gae_lambda = model.gae_lambda
     model.read_learning_rate()

@@ -20,8 +20,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.names import check_overridden_methods
-from sb3_policyflow.common.options import accepts_former_names, own_options
+from sb3_policyflow.common.names import check_overridden_methods, own_options
+from sb3_policyflow.common.options import accepts_former_names
 from sb3_policyflow.common.update import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field

@@ -111,3 +111,20 @@ def check_lr_adaptation(name: str, options: Any) -> None:
         checks.check_options(rule)
     except ValueError as error:
         raise ValueError(f"In {name}, {error}") from error
+
+
+def check_desired_kl(desired_kl: Coefficient, learning_rate: object) -> None:
+    """Refuse a divergence of 0 to start with, and a learning rate that changes beside it.
+
+    :param desired_kl: The target of the adaptive learning rate.
+    :param learning_rate: A number, or a function of the remaining progress.
+    :raises ValueError: With what to use instead.
+    """
+    if parse_schedule("desired_kl", desired_kl)(1.0) == 0:
+        raise ValueError(f"desired_kl must be positive or None, got {desired_kl}.")
+    rate = parse_schedule("learning_rate", learning_rate)
+    if rate(1.0) != rate(0.0):
+        raise ValueError(
+            "With desired_kl the learning rate follows the divergence of the policy: give the "
+            "learning_rate that it starts with, not a schedule."
+        )

@@ -143,7 +143,7 @@ class DPPO(FlowOnPolicyAlgorithm):
         "n_entropy_actions": checks.at_least(2),
         "n_entropy_states": checks.at_least(1),
     }
-    model_checks = (warn_of_wide_bounds, check_warmup)
+    model_checks = (check_warmup,)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(
@@ -170,6 +170,8 @@ class DPPO(FlowOnPolicyAlgorithm):
         self.n_entropy_actions = n_entropy_actions
         self.n_entropy_states = n_entropy_states
         super().__init__(policy, env, *args, **options)
+        if hasattr(self, "policy"):  # not while a file is loaded
+            warn_of_wide_bounds(self.policy)
 
     @property
     def n_evaluations_per_sample(self) -> int:

@@ -64,16 +64,16 @@ def _check_bounds(action_space: spaces.Space[Any]) -> None:
         )
 
 
-def warn_of_wide_bounds(model: Any) -> None:
+def warn_of_wide_bounds(policy: "DPPOPolicy") -> None:
     """Warn where bounds seem to mean nothing, to which "ddpm" scales actions nevertheless.
 
     An untrained policy has a standard deviation of about a fifth of their distance, and what it
     explores in the end is in proportion to it, too.
 
-    :param model: A model, which is new if it has not seen a timestep.
+    :param policy: A policy that has not been trained.
     """
-    box, policy = model.action_space, model.policy
-    if policy.process != "ddpm" or model.num_timesteps > 0:
+    box: Any = policy.action_space
+    if policy.process != "ddpm":
         return
     width = (box.high - box.low).max()
     if width >= SHORTEST_MEANINGLESS:

@@ -90,13 +90,13 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             yield self.env
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self._saved_random_states is not None:
-            self._saved_random_states.restore(self.device)
-            self._saved_random_states = None
         if self.env is None:
             raise ValueError(
                 "The model has no environment to learn in: give one to load, as env, or to set_env."
             )
+        if self._saved_random_states is not None:
+            self._saved_random_states.restore(self.device)
+            self._saved_random_states = None
         with self._guarded():
             prepared = super()._setup_learn(*args, **kwargs)
             self._step_checks.check_observations(self._last_obs, self.num_timesteps)
@@ -113,7 +113,14 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
         :raises FloatingPointError: If environment or policy return a number that is not finite.
         :raises RuntimeError: If a worker process of the environment has died.
+        :raises ValueError: If the buffer is of another size.
         """
+        if n_rollout_steps != rollout_buffer.buffer_size:
+            raise ValueError(
+                f"n_steps cannot change from {rollout_buffer.buffer_size} to {n_rollout_steps}, "
+                "because the rollout buffer was made for it: save the model and load it with "
+                f"load(file, n_steps={n_rollout_steps}), or make another one."
+            )
         first_timestep = self.num_timesteps
         try:
             with self._guarded():
@@ -138,7 +145,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         indices = time_limits(infos, dones)
         if indices and hasattr(self.rollout_buffer, "pending_bonus"):
             values = self._timeout_values(infos, indices).flatten().cpu().numpy()
-            self.rollout_buffer.pending_bonus = PendingBonus(infos, indices, self.gamma * values)
+            bonus = self.rollout_buffer.gamma * values
+            self.rollout_buffer.pending_bonus = PendingBonus(infos, indices, bonus)
 
     def _timeout_values(self, infos: Infos, indices: list[int]) -> th.Tensor:
         """Values of the states with which episodes continue beyond their time limits."""

@@ -12,7 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.options import own_options
+from sb3_policyflow.common.names import own_options
+from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
 from tests.contract.uses import Each, first_line, make, steps
 from tests.helpers import weights
 
@@ -296,3 +297,92 @@ def test_schedule_under_an_adaptive_learning_rate(
     model = new(algorithm, desired_kl=0.01)
     after = unless_refused(model, name, value, lambda: trained(model))
     assert after is None or not th.equal(after, given(algorithm, desired_kl=0.01))
+
+
+# Changes that need more than one option to be judged
+
+
+@pytest.mark.parametrize("name", ["desired_kl", "learning_rate", "ent_coef"])
+def test_schedules_that_end_at_zero(algorithm: type[Any], name: str, tmp_path: Path) -> None:
+    value = "lin_0.01" if name != "learning_rate" else lambda remaining: 0.01 * remaining
+    model = new(algorithm, **{name: value}).learn(64)
+    model.save(tmp_path / "model")
+    algorithm.load(tmp_path / "model", env=steps(2)).learn(64)
+
+
+def test_policies_with_other_defaults(tmp_path: Path) -> None:
+    """What a policy class sets itself has not been changed by the user."""
+    model = PolicyFlow(Quiet, steps(2), n_steps=16, batch_size=8, device="cpu").learn(64)
+    model.save(tmp_path / "model")
+    loaded = PolicyFlow.load(tmp_path / "model", env=steps(2)).learn(32)
+    assert loaded.policy.n_flow_steps == 3
+
+
+class Quiet(PolicyFlowPolicy):
+    """Has defaults of its own."""
+
+    def __init__(self, *args: Any, log_std_init: float = -1.0, **kwargs: Any) -> None:
+        super().__init__(*args, log_std_init=log_std_init, n_flow_steps=3, **kwargs)
+
+
+def test_options_that_do_not_go_together() -> None:
+    model = new(PolicyFlow, brownian_coef=0.5)
+    model.gaussian = True
+    with pytest.raises(ValueError, match="brownian_coef"):
+        model.learn(64)
+
+
+def test_options_changed_to_and_fro(tmp_path: Path) -> None:
+    model = new(PolicyFlow, policy_kwargs={"random_latents": True, "n_flow_steps": 5})
+    for n_flow_steps, random_latents in ((4, False), (5, True), (6, False)):
+        model.n_flow_steps, model.random_latents = n_flow_steps, random_latents
+        model.learn(32).save(tmp_path / "model")
+        loaded = PolicyFlow.load(tmp_path / "model").policy
+        assert (loaded.n_flow_steps, loaded.random_latents) == (n_flow_steps, random_latents)
+
+
+def test_former_names_do_not_come_back(tmp_path: Path) -> None:
+    model = new(PolicyFlow, policy_kwargs={"path": "trigflow"})
+    model.interpolant = "rectified"
+    model.save(tmp_path / "model")
+    assert PolicyFlow.load(tmp_path / "model").interpolant == "rectified"
+
+
+def test_fixed_options_can_be_set_back() -> None:
+    model = new(DPPO)
+    model.policy.denoised_clip = 0.5
+    with pytest.raises(ValueError, match=r"Set denoised_clip to 1\.0 again"):
+        model.learn(32)
+    model.policy.denoised_clip = 1.0
+    model.learn(32)
+
+
+@pytest.mark.parametrize("name", ["gamma", "target_kl", "vf_coef", "max_grad_norm"])
+def test_functions_are_schedules_where_there_are_schedules(algorithm: type[Any], name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        new(algorithm, **{name: lambda remaining: 0.5})
+
+
+class Larger(BaseCallback):
+    """Sets ``n_steps`` when training has begun."""
+
+    def _on_training_start(self) -> None:
+        self.model.n_steps = 32
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_rollouts_cannot_become_longer(algorithm: type[Any]) -> None:
+    with pytest.raises(ValueError, match=r"n_steps cannot change from 16 to 32"):
+        new(algorithm).learn(64, Larger())
+
+
+def test_one_rollout_has_one_gamma(algorithm: type[Any]) -> None:
+    def change(callback: Any) -> None:
+        callback.model.gamma = 0.0
+
+    usual, changed = new(algorithm).learn(32), new(algorithm).learn(32, Each(change))
+    for name in ("rewards", "returns"):
+        found = getattr(changed.rollout_buffer, name)
+        assert (found == getattr(usual.rollout_buffer, name)).all()

@@ -48,12 +48,7 @@ def test_predict_takes_what_ppo_takes(any_algorithm: type[Any], kind: str) -> No
     ids=["short", "3-d", "None", "dict", "nan", "inf"],
 )
 def test_predict_refuses_what_ppo_refuses(
-    any_algorithm: type[Any],
-    given: Any,
-    error: type[Exception],
-    monkeypatch: pytest.MonkeyPatch,
+    any_algorithm: type[Any], given: Any, error: type[Exception]
 ) -> None:
-    # torch.export turns the checks of distributions off, for the rest of the process.
-    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", True)
     with pytest.raises(error):
         make(any_algorithm).predict(given)

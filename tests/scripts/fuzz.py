@@ -259,7 +259,10 @@ def run(algorithm: type[Any], options: dict[str, Any], environment: dict[str, An
         _sentence(refusal)
     for name, parameter in model.policy.named_parameters():
         assert th.isfinite(parameter).all(), f"{name} is not finite"
-    action, _ = model.predict(parts["observation_space"].sample())
+    try:
+        action, _ = model.predict(parts["observation_space"].sample())
+    except FloatingPointError as refusal:  # the last update has spoiled the policy
+        return _sentence(refusal)
     assert parts["action_space"].contains(action.astype(parts["action_space"].dtype))
     return "trained"
 
