@@ -138,10 +138,9 @@ def with_present_names(
     present = {name: value for name, value in options.items() if name not in former_names}
     for former in former_names.keys() & options.keys():
         name, _, key = former_names[former].partition(".")
-        if key:
-            present[name] = {**(present.get(name) or {}), key: options[former]}
-        else:
-            present.setdefault(name, options[former])
+        present[name] = (
+            {**(present.get(name) or {}), key: options[former]} if key else options[former]
+        )
         _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
     for name, former in _former_values(present):
         present[name] = FORMER_VALUES[name, former]

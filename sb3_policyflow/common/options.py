@@ -215,7 +215,11 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
 
         @functools.wraps(init)
         def extended(*args: P.args, **options: P.kwargs) -> None:
-            present = with_present_names(options, former_names)
+            # A present name has been set later than a former one in policy_kwargs.
+            given = {
+                name: options[name] for name in options if former_names.get(name) not in options
+            }
+            present = with_present_names(given, former_names)
             for name in present.keys() - parameters.keys() if not hands_on else ():
                 owner = type(args[0])
                 raise unknown_argument(owner.__name__, name, policy_parameters(owner))
