@@ -81,7 +81,7 @@ def warn_of_wide_bounds(policy: "DPPOPolicy") -> None:
             f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
             f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "
             f"stand for none, {ADVICE}.",
-            stacklevel=2,
+            stacklevel=4,
         )
 
 
