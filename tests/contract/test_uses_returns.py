@@ -90,12 +90,12 @@ class OwnMemory(Simulator):
     """Returns an array of its own, and looks whether it is as it left it."""
 
     def __init__(self, read_only: bool) -> None:
-        super().__init__(rewards=self._pay)
+        super().__init__(rewards=self.pay)
         self.read_only = read_only
         self.balance, self.record = np.zeros(2, np.float32), np.zeros(2, np.float32)
         self.touched = 0
 
-    def _pay(self, rewards: np.ndarray) -> np.ndarray:
+    def pay(self, rewards: np.ndarray) -> np.ndarray:
         self.touched += not np.array_equal(self.balance, self.record)
         self.balance.flags.writeable = True
         self.balance[:] = rewards
@@ -169,7 +169,7 @@ def test_locals_env_is_used(any_algorithm: type[Any]) -> None:
         env = callback.locals["env"]
         assert env.get_attr("time") == [one.time for one in env.envs]
         env.set_attr("length", 7, indices=[1])
-        assert env.env_method("_observe")[0].shape == (3,)
+        assert env.env_method("observe")[0].shape == (3,)
         env.set_options({"option": 1})
         rewards = env.buf_rews
         rewards[:] = 100.0  # SB3's environments hand out copies

@@ -82,33 +82,33 @@ class Hooks(BaseCallback):
         super().__init__()
         self.calls: list[tuple[str, int]] = []
 
-    def _note(self, name: str) -> bool:
+    def write_down(self, name: str) -> bool:
         self.calls.append((name, self.model.num_timesteps))
         return True
 
     def _init_callback(self) -> None:
-        self._note("init")
+        self.write_down("init")
 
     def _on_training_start(self) -> None:
-        self._note("training_start")
+        self.write_down("training_start")
         assert {"total_timesteps", "callback", "log_interval"} <= self.locals.keys()
 
     def _on_rollout_start(self) -> None:
-        self._note("rollout_start")
+        self.write_down("rollout_start")
 
     def _on_step(self) -> bool:
         assert self.n_calls * self.training_env.num_envs == self.num_timesteps
-        return self._note("step")
+        return self.write_down("step")
 
     def _on_rollout_end(self) -> None:
-        self._note("rollout_end")
+        self.write_down("rollout_end")
         buffer = self.locals["rollout_buffer"]
         assert buffer is self.model.rollout_buffer  # type: ignore[attr-defined]
         assert buffer.full
         assert buffer.advantages.shape == (16, 2)
 
     def _on_training_end(self) -> None:
-        self._note("training_end")
+        self.write_down("training_end")
 
 
 def test_hooks_are_called_as_by_ppo(algorithm: type[Any]) -> None:

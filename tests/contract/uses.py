@@ -34,20 +34,20 @@ class Steps(gym.Env[Any, Any]):
         self.actions: list[np.ndarray] = []
         self.time = 0
 
-    def _observe(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         return np.sin(self.time + np.arange(3.0)).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.time = 0
-        return self._observe(), {}
+        return self.observe(), {}
 
     def step(self, action: Any) -> Any:
         self.time += 1
         self.actions.append(np.array(action))
         is_over = self.time == self.length
         reward = 1.0 - float(np.square(action).mean())
-        return self._observe(), reward, is_over and not self.is_limit, is_over and self.is_limit, {}
+        return self.observe(), reward, is_over and not self.is_limit, is_over and self.is_limit, {}
 
 
 def steps(n_envs: int = 1, **options: Any) -> DummyVecEnv:
@@ -78,13 +78,13 @@ class Simulator(VecEnv):
         self.make_infos, self.make_terminal = infos, terminal
         self.time = 0
 
-    def _observe(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         times = self.time + np.arange(3.0) + np.arange(self.num_envs)[:, None]
         return np.sin(times).astype(np.float32)
 
     def reset(self) -> Any:
         self.time = 0
-        return self._observe()
+        return self.observe()
 
     def step_async(self, actions: np.ndarray) -> None:
         self.actions = actions
@@ -93,12 +93,12 @@ class Simulator(VecEnv):
         self.time += 1
         is_over = self.time % 5 == 0
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for info, last in zip(infos if is_over else [], self._observe(), strict=False):
+        for info, last in zip(infos if is_over else [], self.observe(), strict=False):
             info["TimeLimit.truncated"] = True
             info["terminal_observation"] = self.make_terminal(last)
         rewards = self.make_rewards(self.time % 7 + np.arange(self.num_envs))
         dones = self.make_dones(np.full(self.num_envs, is_over))
-        return self._observe(), rewards, dones, self.make_infos(infos)
+        return self.observe(), rewards, dones, self.make_infos(infos)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         raise AttributeError(attr_name)

@@ -56,14 +56,14 @@ class LabEnv(gym.Env[Any, Any]):
         return seed
 
     def reset(self, **options: Any) -> Any:
-        self.position, self.time = self._start(self.num_envs)
-        return self._observe(), {}
+        self.position, self.time = self.begin(self.num_envs)
+        return self.observe(), {}
 
-    def _start(self, number: int) -> tuple[th.Tensor, th.Tensor]:
+    def begin(self, number: int) -> tuple[th.Tensor, th.Tensor]:
         time = th.randint(0, LIMIT, (number,), generator=self.generator)
         return th.randn(number, 2, generator=self.generator), time
 
-    def _observe(self) -> dict[str, th.Tensor]:
+    def observe(self) -> dict[str, th.Tensor]:
         return {"policy": th.cat([self.position, self.time.unsqueeze(1)], dim=1)}
 
     def step(self, action: th.Tensor) -> Any:
@@ -75,9 +75,9 @@ class LabEnv(gym.Env[Any, Any]):
         over = terminated | truncated
         extras: dict[str, Any] = {"log": {"reached": distance.mean()}}
         if over.any() and getattr(self.cfg, "compute_final_obs", False):
-            extras["final_obs"] = self._observe()
-        self.position[over], self.time[over] = self._start(int(over.sum()))
-        return self._observe(), -distance, terminated, truncated, extras
+            extras["final_obs"] = self.observe()
+        self.position[over], self.time[over] = self.begin(int(over.sum()))
+        return self.observe(), -distance, terminated, truncated, extras
 
     def close(self) -> None:
         print("environment closed")  # noqa: T201  # the tests look for it
@@ -102,7 +102,7 @@ class Sb3Wrapper(VecEnv):
 
     def reset(self) -> Any:
         self.returns, self.lengths = np.zeros(self.num_envs), np.zeros(self.num_envs)
-        return self._array(self.env.reset()[0])
+        return self.as_array(self.env.reset()[0])
 
     def step_async(self, actions: Any) -> None:
         self.actions = th.as_tensor(actions, dtype=th.float32)
@@ -110,14 +110,14 @@ class Sb3Wrapper(VecEnv):
     def step_wait(self) -> Any:
         observations, rewards, terminated, truncated, extras = self.env.step(self.actions)
         parts = (rewards.numpy(), terminated.numpy(), truncated.numpy())
-        infos = self._infos(self._array(observations), *parts, extras)
-        return self._array(observations), parts[0], parts[1] | parts[2], infos
+        infos = self.make_infos(self.as_array(observations), *parts, extras)
+        return self.as_array(observations), parts[0], parts[1] | parts[2], infos
 
-    def _infos(
+    def make_infos(
         self, observations: Any, rewards: Any, terminated: Any, truncated: Any, extras: Any
     ) -> Any:
         self.returns, self.lengths = self.returns + rewards, self.lengths + 1
-        last = self._array(extras["final_obs"]) if "final_obs" in extras else observations
+        last = self.as_array(extras["final_obs"]) if "final_obs" in extras else observations
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(terminated | truncated):
             infos[index] = {
@@ -128,7 +128,7 @@ class Sb3Wrapper(VecEnv):
             self.returns[index] = self.lengths[index] = 0
         return infos
 
-    def _array(self, observations: Any) -> Any:
+    def as_array(self, observations: Any) -> Any:
         return observations["policy"].numpy()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> Any:
