@@ -22,6 +22,8 @@ from sb3_policyflow import DPPO, FPO, PolicyFlow
 from tests.contract.uses import ACTIONS, OBSERVATIONS, learned, make, steps
 from tests.helpers import SMALL, weights
 
+pytestmark = pytest.mark.slow
+
 SEEN = np.linspace(-1, 1, 30).reshape(10, 3).astype(np.float32)
 
 

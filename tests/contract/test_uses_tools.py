@@ -17,6 +17,8 @@ from torch.nn.utils import parametrizations, prune
 from tests.contract.uses import learned, make, output_layer
 from tests.helpers import assert_trained, weights
 
+pytestmark = pytest.mark.slow
+
 SEEN = np.linspace(-1, 1, 30).reshape(10, 3).astype(np.float32)
 
 

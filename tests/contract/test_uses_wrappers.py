@@ -25,6 +25,8 @@ from tests.contract.uses import (
 )
 from tests.helpers import assert_trained, weights
 
+pytestmark = pytest.mark.slow
+
 # What wrappers override
 
 
