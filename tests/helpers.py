@@ -1,5 +1,8 @@
 """What the tests share: small runs, and a model's numbers to compare."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch as th
@@ -103,3 +106,19 @@ def n_updates(model: Any) -> int:
 def last_observations(model: Any) -> Any:
     """The observations that the next rollout starts with; None if it resets the environment."""
     return model._last_obs
+
+
+@contextmanager
+def within(seconds: int) -> Iterator[None]:
+    """A block that ends in time, or fails."""
+
+    def stop(*_: object) -> None:
+        raise TimeoutError(f"not done after {seconds} s")
+
+    former = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, former)

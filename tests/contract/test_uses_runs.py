@@ -22,8 +22,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from tests.contract.uses import Each, Steps, make, steps, within
-from tests.helpers import assert_trained, weights
+from tests.contract.uses import Each, Steps, make, steps
+from tests.helpers import assert_trained, weights, within
 
 # Workers
 

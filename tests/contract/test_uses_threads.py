@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch as th
 
-from tests.contract.uses import changed_objects, learned, make, output_layer, steps, within
-from tests.helpers import assert_trained, weights
+from tests.contract.uses import changed_objects, learned, make, output_layer, steps
+from tests.helpers import assert_trained, weights, within
 
 SEEN = np.linspace(-1, 1, 30).reshape(10, 3).astype(np.float32)
 

@@ -1,8 +1,6 @@
 """What the tests of users' habits share: environments that can be foretold, and small models."""
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -216,19 +214,3 @@ def keep(kept: list[tuple[str, Any, Any]], names: tuple[str, ...]) -> Each:
             (name, callback.locals[name], deepcopy(callback.locals[name])) for name in names
         )
     )
-
-
-@contextmanager
-def within(seconds: int) -> Iterator[None]:
-    """A block that ends in time, or fails."""
-
-    def stop(*_: object) -> None:
-        raise TimeoutError(f"not done after {seconds} s")
-
-    former = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, former)

@@ -2,8 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from sb3_policyflow import PolicyFlow
 from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 from sb3_policyflow.fpo import FPO
-from tests.helpers import SMALL, train, weights
+from tests.helpers import SMALL, train, weights, within
 
 FAULT_STEP = 5
 EIGHT_STEPS: dict[str, Any] = {**SMALL, "n_steps": 8, "batch_size": 16}
@@ -71,22 +70,6 @@ def make(fault: str, **options: Any) -> list[Callable[[], gym.Env[Any, Any]]]:
 def trained(env: VecEnv, **options: Any) -> PolicyFlow:
     policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
     return PolicyFlow(policy, env, **{**EIGHT_STEPS, **options})
-
-
-@contextmanager
-def within(seconds: int) -> Iterator[None]:
-    """Fail a test that hangs."""
-
-    def give_up(*_: Any) -> None:
-        raise TimeoutError(f"hung for {seconds} seconds")
-
-    before = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def assert_saves_and_goes_on(model: PolicyFlow, folder: Path) -> None:
