@@ -21,9 +21,8 @@ from tests.contract.uses import (
     Steps,
     make,
     steps,
-    within,
 )
-from tests.helpers import assert_trained, weights
+from tests.helpers import assert_trained, weights, within
 
 pytestmark = pytest.mark.slow
 
