@@ -13,7 +13,12 @@ from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.common.schedules import Coefficient, KLAdaptiveLearningRate, parse_schedule
+from sb3_policyflow.common.schedules import (
+    Coefficient,
+    KLAdaptiveLearningRate,
+    parse_schedule,
+    start_adaptive_learning_rate,
+)
 from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
@@ -149,7 +154,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.clip_range = FloatSchedule(self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        self._start_adaptive_learning_rate()
+        start_adaptive_learning_rate(self)
         for check in self.model_checks:
             check(self)
 
@@ -164,12 +169,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         schedule = parse_schedule(name, getattr(self, name))
         return float(schedule(self._current_progress_remaining))
 
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
-        # The last rollout may end beyond total_timesteps, where SB3's value is negative and a
-        # linear schedule with it: a negative learning rate would ascend the loss.
-        self._current_progress_remaining = max(0.0, self._current_progress_remaining)
-
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
         self._learning_rates = self.learning_rate, self.lr_schedule
@@ -182,20 +181,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         if self.learning_rate is not learning_rate:
             self._setup_lr_schedule()
 
-    def _start_adaptive_learning_rate(self) -> None:
-        """Start with ``learning_rate``, unless a run continues that started with it."""
-        start = self.lr_schedule(1.0)
-        if self.desired_kl is None:
-            self.adaptive_learning_rate = None
-        elif self.adaptive_learning_rate is None or start != self._adaptive_start:
-            self.adaptive_learning_rate = start
-        self._adaptive_start = start
-
     def _update_learning_rate(
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
         options.take_up_changes(self)
-        self._start_adaptive_learning_rate()
+        start_adaptive_learning_rate(self)
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)
             return

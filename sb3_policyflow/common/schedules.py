@@ -128,3 +128,16 @@ def check_desired_kl(desired_kl: Coefficient, learning_rate: object) -> None:
             "With desired_kl the learning rate follows the divergence of the policy: give the "
             "learning_rate that it starts with, not a schedule."
         )
+
+
+def start_adaptive_learning_rate(model: Any) -> None:
+    """Start with ``learning_rate``, unless a run continues that started with it.
+
+    :param model: An algorithm, whose ``adaptive_learning_rate`` is None without ``desired_kl``.
+    """
+    start = model.lr_schedule(1.0)
+    if model.desired_kl is None:
+        model.adaptive_learning_rate = None
+    elif model.adaptive_learning_rate is None or start != model._adaptive_start:
+        model.adaptive_learning_rate = start
+    model._adaptive_start = start

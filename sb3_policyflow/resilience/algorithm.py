@@ -80,6 +80,12 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     # Collecting rollouts
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may end beyond total_timesteps, where SB3's value is negative and a
+        # linear schedule with it: a negative learning rate would ascend the loss.
+        self._current_progress_remaining = max(0.0, self._current_progress_remaining)
+
     @contextmanager
     def _guarded(self) -> Iterator[VecEnv]:
         """A block that uses the environment; names its faults and undoes what can be undone."""
