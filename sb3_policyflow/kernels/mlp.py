@@ -27,6 +27,7 @@ from sb3_policyflow.kernels.layouts import (
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
 NO_INDEX: Integers = np.zeros(0, dtype=np.int64)
+NO_POINTS: Floats = np.zeros((0, 0), dtype=np.float32)
 
 
 class MLP:
@@ -99,11 +100,10 @@ def read_mlp(kernels: Kernels, inspector: ModuleInspector, modules: Iterable[nn.
 
 
 class Gradients(NamedTuple):
-    """Gradients of an MLP: of W^T and table, see :class:`KernelInput`, shifts, and other layers."""
+    """Gradients of an MLP: of first weights and table, see :class:`KernelInput`, other layers."""
 
-    points: th.Tensor
+    weights: th.Tensor
     table: th.Tensor
-    shifts: Floats
     others: list[th.Tensor]
 
 
@@ -146,6 +146,7 @@ class Evaluation:
         parameters: Sequence[th.Tensor],
         grad_outputs: th.Tensor,
         grad_points: Floats,
+        grad_features: Floats,
     ) -> Gradients:
         """Differentiate.
 
@@ -153,43 +154,63 @@ class Evaluation:
         :param parameters: Those of the MLP again.
         :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
         :param grad_points: Filled; shape (n, n_points), or empty if it is not wanted.
+        :param grad_features: Filled; shape (m, n_features), or empty if it is not wanted.
         """
         network, first = self._network, self._first
-        n_points, (n_entries, width) = first.points.shape[1], first.table.shape
-        sizes = [n_points * width, n_entries * width, *(p.numel() for p in parameters[2:])]
-        # Each thread adds up its own; rows that share a shift belong to one thread.
+        sizes = gradient_sizes(first, parameters)
+        # Each thread adds up its own.
         flat = th.zeros(self._n_parts, sum(sizes), dtype=th.float32, device="cpu")
-        shifts, of_thread = np.zeros_like(first.shifts), flat.numpy()
+        of_thread = flat.numpy()
         layout, (values, derivatives) = network.layout_of(parameters), saved.numpy()
         outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
 
         def run_part(part: int, start: int, stop: int) -> None:
-            gradients = MLPGradients(of_thread[part], shifts, grad_points)
+            gradients = MLPGradients(of_thread[part], grad_points, grad_features)
             run(first, layout, values, derivatives, outputs, gradients, start, stop)
 
         self._in_parts(run_part)
         total = flat[0] if self._n_parts == 1 else flat.sum(0)
-        points, table, *others = th.split(total, sizes)
-        return Gradients(
-            points.view(n_points, width),
-            table.view(n_entries, width),
-            shifts,
-            [part.view(p.shape) for part, p in zip(others, parameters[2:], strict=True)],
-        )
+        return split_gradients(total, sizes, first, parameters)
 
     def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
         """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both passes.
 
-        What is saved depends on where blocks of rows begin, and rows that share a shift belong
-        together.
+        What is saved depends on where blocks of rows begin, and rows of a sample belong together.
         """
-        n_rows, n_shifts = len(self._first.points), len(self._first.shifts)
-        group = n_rows // n_shifts if n_shifts else 1
+        n_samples = len(self._first.features)
+        group = len(self._first.points) // n_samples
         in_parts(
-            n_rows // group,
+            n_samples,
             self._n_parts,
             lambda part, start, stop: run(part, start * group, stop * group),
         )
+
+
+def gradient_sizes(first: KernelInput, parameters: Sequence[th.Tensor]) -> list[int]:
+    """How many numbers the parts of an MLP's gradients have, see :class:`MLPGradients`.
+
+    :param first: The first layer.
+    :param parameters: Weight and bias of each layer.
+    """
+    return [first.weights.size, first.table.size, *(p.numel() for p in parameters[2:])]
+
+
+def split_gradients(
+    flat: th.Tensor, sizes: list[int], first: KernelInput, parameters: Sequence[th.Tensor]
+) -> Gradients:
+    """The parts of an MLP's gradients, views of the tensor that has them all.
+
+    :param flat: The gradients.
+    :param sizes: Their :func:`gradient_sizes`.
+    :param first: The first layer.
+    :param parameters: Weight and bias of each layer.
+    """
+    weights, table, *others = th.split(flat, sizes)
+    return Gradients(
+        weights.view(first.weights.shape),
+        table.view(first.table.shape),
+        [part.view(p.shape) for part, p in zip(others, parameters[2:], strict=True)],
+    )
 
 
 class _MLPEvaluation(th.autograd.Function):
@@ -210,23 +231,30 @@ class _MLPEvaluation(th.autograd.Function):
             module = nn.Sequential(*ctx.network.modules)
             return None, *differentiable_gradients(module, [inputs], parameters, grad_outputs)
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
-        gradients = ctx.evaluation.backward(saved, parameters, grad_outputs, grad_inputs.numpy())
+        gradients = ctx.evaluation.backward(
+            saved, parameters, grad_outputs, NO_POINTS, grad_inputs.numpy()
+        )
         return (
             None,
             grad_inputs if ctx.needs_input_grad[1] else None,
-            gradients.points.T.contiguous(),
+            gradients.weights.T.contiguous(),
             gradients.table[0],
             *gradients.others,
         )
 
 
-def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
-    bias = network.held[1].numpy()
-    no_shifts = np.zeros((0, bias.size), dtype=np.float32)
-    points = inputs.detach().numpy()
-    return Evaluation(
-        network, KernelInput(points, inputs.shape[1], bias[None], NO_INDEX, no_shifts)
+def mlp_input(network: MLP, inputs: th.Tensor) -> KernelInput:
+    """An MLP's first layer as kernels take it: inputs are features, and there are no points."""
+    weight, bias = network.held[0].numpy(), network.held[1].numpy()
+    features = inputs.detach().numpy()
+    no_points = np.empty((len(features), 0), dtype=np.float32)
+    return KernelInput(
+        no_points, features, np.ascontiguousarray(weight.T), bias[None], NO_INDEX
     )
+
+
+def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
+    return Evaluation(network, mlp_input(network, inputs))
 
 
 def differentiable_gradients(

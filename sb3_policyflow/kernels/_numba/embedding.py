@@ -1,6 +1,6 @@
-"""What time and observation contribute to the first layer of a velocity field.
+"""A velocity field up to its first layer, as a table of times and weights of points and features.
 
-table = (MLP(cos, sin of 2 pi f t) + b_o) W_e^T + b,    shifts = features (W_e W_o)^T
+table = (MLP(cos, sin of 2 pi f t) + b_o) W_e^T + b,    weights = [W_x, W_e W_o]^T
 """
 
 import math
@@ -72,11 +72,10 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> No
 
 
 @kernel
-def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer) -> int:
-    """Evaluate what times and features contribute to a field's first layer.
+def embed(times: Floats, field: FieldLayout, first: FirstLayer) -> int:
+    """Evaluate a field up to what points and features contribute to its first layer.
 
     :param times: shape (n_times,); the distinct ones are moved to the front.
-    :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
     :param first: Filled; the table is as long as there are distinct times.
     :return: How many distinct times there are.
@@ -94,53 +93,46 @@ def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer
     _layer(hidden, weights, vector(field.time_output_bias, size), embeddings)
     for row in range(n):
         add(vector(field.observation_bias, size), embeddings[row])
-    of_embedding = transposed(matrix(field.first_weight, width, dim + size))[dim:]
+    first_weights = transposed(matrix(field.first_weight, width, dim + size))
+    of_embedding = first_weights[dim:]
     _layer(embeddings, of_embedding, vector(field.first_bias, width), table)
-    clear(first.shifts)
-    observation = matrix(field.observation_weight, size, features.shape[1])
-    accumulate(features, product(observation.T, of_embedding), first.shifts)
+    for i in range(dim):
+        copy(first_weights[i], first.weights[i])
+    observation = matrix(field.observation_weight, size, first.weights.shape[0] - dim)
+    _fill_product(transposed(observation), of_embedding, first.weights[dim:])
     return n
 
 
 @kernel
 def embed_backward(
-    times: Floats,
-    features: Floats,
-    field: FieldLayout,
-    first: FirstLayer,
-    gradients: FieldGradients,
+    times: Floats, field: FieldLayout, first: FirstLayer, gradients: FieldGradients
 ) -> None:
     """Gradients of what :func:`embed` takes.
 
     :param times: The distinct times, shape (n_times,).
-    :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
     :param first: What :func:`embed` filled.
     :param gradients: Of the first layer, and filled.
     """
     n, dim, (width, n_inputs) = times.size, field.dim, gradients.first_weight.shape
-    size, n_features = n_inputs - dim, features.shape[1]
+    size, n_features = n_inputs - dim, gradients.weights.shape[0] - dim
     hidden, derivatives, embeddings = first.hidden[:n], first.derivatives[:n], first.embeddings[:n]
     first_weight = matrix(field.first_weight, width, n_inputs)
     of_embedding = np.empty((width, size), F)
     for row in range(width):
         copy(first_weight[row, dim:], of_embedding[row])
     observation = transposed(matrix(field.observation_weight, size, n_features))
-    grad_folded = product(features.T, gradients.shifts)
-    grad_of_embedding = product(gradients.table.T, embeddings)
-    accumulate(grad_folded.T, observation, grad_of_embedding)
+    grad_folded = gradients.weights[dim:]
+    grad_of_embedding = product(transposed(gradients.table), embeddings)
+    accumulate(transposed(grad_folded), observation, grad_of_embedding)
     grad_embeddings = product(gradients.table, of_embedding)
     grad_hidden = product(grad_embeddings, matrix(field.time_output_weight, size, size))
     multiply(grad_hidden.reshape(-1), derivatives.reshape(-1))
-    if gradients.features.shape[0] > 0:
-        clear(gradients.features)
-        folded = product(observation, transposed(of_embedding))
-        accumulate(gradients.shifts, transposed(folded), gradients.features)
 
     phases = _phases(times, vector(field.frequencies, field.n_frequencies))
-    _fill_product(grad_hidden.T, phases, gradients.time_hidden_weight)
+    _fill_product(transposed(grad_hidden), phases, gradients.time_hidden_weight)
     _fill_sums(grad_hidden, gradients.time_hidden_bias)
-    _fill_product(grad_embeddings.T, hidden, gradients.time_output_weight)
+    _fill_product(transposed(grad_embeddings), hidden, gradients.time_output_weight)
     _fill_sums(grad_embeddings, gradients.time_output_bias)
     copy(
         transposed(product(grad_folded, of_embedding)).reshape(-1),
@@ -149,7 +141,7 @@ def embed_backward(
     copy(gradients.time_output_bias, gradients.observation_bias)
     for row in range(width):
         for i in range(dim):
-            gradients.first_weight[row, i] = gradients.points[i, row]
+            gradients.first_weight[row, i] = gradients.weights[i, row]
         copy(grad_of_embedding[row], gradients.first_weight[row, dim:])
     _fill_sums(gradients.table, gradients.first_bias)
 
