@@ -176,7 +176,7 @@ class LossOptions(NamedTuple):
 
     The ``end_time`` of the interpolant, the ``latent_std``, whether the mean shift over a sample's
     times has one surrogate (``averages_shift``), infinity for bounds that there are not,
-    ``sums_dimensions`` of the Brownian regularizer, and the weights of regularizer and critic.
+    ``sums_dimensions`` of the Brownian regularizer, and the weights of regularizers and critic.
     """
 
     end_time: float
@@ -186,6 +186,7 @@ class LossOptions(NamedTuple):
     log_ratio_clamp: float
     brownian_coef: float
     sums_dimensions: bool
+    ent_coef: float
     vf_coef: float
     clip_range_vf: float
 

@@ -248,9 +248,7 @@ def mlp_input(network: MLP, inputs: th.Tensor) -> KernelInput:
     weight, bias = network.held[0].numpy(), network.held[1].numpy()
     features = inputs.detach().numpy()
     no_points = np.empty((len(features), 0), dtype=np.float32)
-    return KernelInput(
-        no_points, features, np.ascontiguousarray(weight.T), bias[None], NO_INDEX
-    )
+    return KernelInput(no_points, features, np.ascontiguousarray(weight.T), bias[None], NO_INDEX)
 
 
 def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:

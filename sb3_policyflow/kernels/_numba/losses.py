@@ -92,7 +92,14 @@ def loss_gradients(
         project(last, weight, bias, outputs[:rows])
         if is_actor:
             _actor_loss(
-                first, targets, options, outputs[:rows], grad_outputs[:rows], of_log_std, sums, begin
+                first,
+                targets,
+                options,
+                outputs[:rows],
+                grad_outputs[:rows],
+                of_log_std,
+                sums,
+                begin,
             )
         else:
             _critic_loss(targets, options, outputs[:rows], grad_outputs[:rows], sums, begin)
