@@ -20,6 +20,7 @@ from sb3_policyflow.common.schedules import (
 )
 from sb3_policyflow.common.update import (
     FlowUpdate,
+    Loss,
     UpdateMetrics,
     check_step,
     clip_gradients,
@@ -251,9 +252,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return advantages
 
-    def _optimize(
-        self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
-    ) -> None:
+    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
@@ -261,13 +260,13 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         for parameter in parameters:
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
-        th.autograd.backward(loss, inputs=trained)
+        loss.backward(inputs=trained)
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
         take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
 
-    def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+    def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
@@ -26,13 +26,23 @@ class PolicyTerms(NamedTuple):
     metrics: dict[str, th.Tensor]
 
 
+class Loss(Protocol):
+    """What a step of the optimizer needs of a loss: a tensor is one."""
+
+    def item(self) -> float:
+        """Its value."""
+
+    def backward(self, *, inputs: Any = None) -> None:
+        """Add its gradients to those of the parameters; of ``inputs`` only, if they are given."""
+
+
 class CompiledTerms(NamedTuple):
     """A minibatch's loss and divergence, see :class:`PolicyTerms`, and what is to be logged.
 
     Means over the minibatches are logged of ``means``, and the greatest of ``maxima``.
     """
 
-    loss: th.Tensor
+    loss: Loss
     kl: th.Tensor
     means: dict[str, float]
     maxima: dict[str, float]
@@ -86,7 +96,7 @@ class FlowUpdate(ABC):
 
     def loss(
         self, batch: FlowRolloutBufferSamples, metrics: "UpdateMetrics"
-    ) -> tuple[th.Tensor, th.Tensor]:
+    ) -> tuple[Loss, th.Tensor]:
         """The loss of a minibatch (paper, algorithm 1, lines 18 to 21).
 
         :param batch: n samples, with what was drawn for them.

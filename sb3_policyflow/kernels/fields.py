@@ -17,7 +17,6 @@ from sb3_policyflow.kernels.inspection import (
     are_usable,
 )
 from sb3_policyflow.kernels.layouts import (
-    FieldGradients,
     FieldLayout,
     FirstLayer,
     Floats,
@@ -27,10 +26,10 @@ from sb3_policyflow.kernels.layouts import (
 from sb3_policyflow.kernels.mlp import (
     MLP,
     Evaluation,
-    Gradients,
     any_needs_grad,
     differentiable_gradients,
     read_mlp,
+    views_like,
 )
 
 
@@ -55,6 +54,7 @@ class FieldParts:
         self.features_dim = observation.weight.shape[1]
         # In the order of FieldLayout and of named_parameters.
         self.embedding = [*time.tensors, *observation, *network.layers[0]]
+        self.n_embedding = sum(tensor.numel() for tensor in self.embedding)
         self.parameters = [*self.embedding, *network.tensors[2:]]
         self.tensors = [frequencies, *self.parameters]
         embedding = [*time.held, *(tensor.detach() for tensor in observation), *network.held[:2]]
@@ -165,6 +165,7 @@ class Embedding:
             np.empty((parts.dim + parts.features_dim, width), dtype=np.float32),
             np.empty((n_times, width), dtype=np.float32),
             np.empty(n_times, dtype=np.int64),
+            np.empty((n_times, parts.time.n_inputs), dtype=np.float32),
             *np.empty((3, n_times, size), dtype=np.float32),
         )
         n_distinct = parts.kernels.embed(distinct, parts.layout, self._first)
@@ -187,26 +188,13 @@ class Embedding:
             entries = np.broadcast_to(entries.reshape(times_shape), leading).flatten()
         return KernelInput(points, features, weights, table[: len(self.times)], entries)
 
-    def backward(self, gradients: Gradients) -> list[th.Tensor]:
+    def backward(self, grad_first: Floats, grads: Floats) -> None:
         """Gradients of the parameters up to the first layer.
 
-        :param gradients: Those of the network.
+        :param grad_first: Those of the first layer's weights and table, flat.
+        :param grads: Filled with those of the ``embedding`` of the parts, flat.
         """
-        shapes = [tensor.shape for tensor in self._parts.embedding]
-        flat = th.empty(sum(shape.numel() for shape in shapes), dtype=th.float32, device="cpu")
-        pieces = th.split(flat, [shape.numel() for shape in shapes])
-        grads = [piece.view(shape) for piece, shape in zip(pieces, shapes, strict=True)]
-        self._parts.kernels.embed_backward(
-            self.times,
-            self._parts.layout,
-            self._first,
-            FieldGradients(
-                gradients.weights.numpy(),
-                gradients.table.numpy(),
-                *(grad.numpy() for grad in grads),
-            ),
-        )
-        return grads
+        self._parts.kernels.embed_backward(self._parts.layout, self._first, grad_first, grads)
 
 
 def _evaluation(
@@ -254,21 +242,23 @@ class _FieldEvaluation(th.autograd.Function):
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])
         n_embedding, parts = len(ctx.parts.embedding), ctx.parts
-        gradients = ctx.evaluation.backward(
+        of_first, others = ctx.evaluation.backward(
             saved,
             parameters[n_embedding - 2 :],
             grad_outputs.reshape(-1, parts.dim),
             grad_points.view(-1, parts.dim).numpy(),
             grad_features.view(-1, parts.features_dim).numpy(),
         )
+        of_embedding = th.empty(parts.n_embedding, dtype=th.float32, device="cpu")
+        ctx.embedding.backward(of_first.numpy(), of_embedding.numpy())
         return (
             None,
             None,
             None,
             grad_points if needs_points else None,
             grad_features if needs_features else None,
-            *ctx.embedding.backward(gradients),
-            *gradients.others,
+            *views_like(parts.embedding, of_embedding),
+            *others,
         )
 
 

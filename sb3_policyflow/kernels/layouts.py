@@ -48,12 +48,14 @@ class MLPLayout(NamedTuple):
 class MLPGradients(NamedTuple):
     """Gradients that an MLP's backward pass adds to.
 
-    ``parameters``: those of the first layer's weights (n_points + n_features, h), of the table, and
-    of weight and bias of each layer behind the first, flat, one behind the other. ``points``
-    (n, n_points) and ``features`` (m, n_features) are filled, or empty if they are not wanted.
+    ``first``: those of the first layer's weights (n_points + n_features, h) and of the table, and
+    ``others``: those of weight and bias of each layer behind the first, flat, one behind the other.
+    ``points`` (n, n_points) and ``features`` (m, n_features) are filled, or empty if they are not
+    wanted.
     """
 
-    parameters: Floats
+    first: Floats
+    others: Floats
     points: Floats
     features: Floats
 
@@ -85,37 +87,18 @@ class FirstLayer(NamedTuple):
     """A field's first layer of h outputs, for points and features, and what comes before it.
 
     The ``weights`` (dim + n_features, h) of points and features; the ``table`` of distinct times
-    (n_times, h); the ``entries`` of it for each time (n_times,). For the backward pass the time
-    embedding's ``hidden`` layer, its ``derivatives``, and the ``embeddings`` plus b_o, each
-    (n_times, embedding_dim).
+    (n_times, h); the ``entries`` of it for each time (n_times,). For the backward pass the
+    ``phases`` of the times (n_times, 2 n_frequencies); the time embedding's ``hidden`` layer, its
+    ``derivatives``, and the ``embeddings`` plus b_o, each (n_times, embedding_dim).
     """
 
     weights: Floats
     table: Floats
     entries: Integers
+    phases: Floats
     hidden: Floats
     derivatives: Floats
     embeddings: Floats
-
-
-class FieldGradients(NamedTuple):
-    """Gradients of a field's first layer, and what follows from them.
-
-    Given are those of the first layer, of h outputs: ``weights`` (dim + n_features, h) and
-    ``table`` (n_times, h). Filled are those of the parameters in :class:`FieldLayout`, of their
-    shapes.
-    """
-
-    weights: Floats
-    table: Floats
-    time_hidden_weight: Floats
-    time_hidden_bias: Floats
-    time_output_weight: Floats
-    time_output_bias: Floats
-    observation_weight: Floats
-    observation_bias: Floats
-    first_weight: Floats
-    first_bias: Floats
 
 
 class FoldedNetwork(NamedTuple):
@@ -255,7 +238,7 @@ class Kernels(Protocol):
         """Evaluate a field up to what points and features contribute to its first layer."""
 
     def embed_backward(
-        self, times: Floats, field: FieldLayout, first: FirstLayer, gradients: FieldGradients
+        self, field: FieldLayout, first: FirstLayer, grad_first: Floats, grads: Floats
     ) -> None:
         """Gradients of what :meth:`embed` takes."""
 

@@ -1,7 +1,7 @@
-"""The losses of PolicyFlow's actor and of the critic as one node of autograd's graph."""
+"""The losses of PolicyFlow's actor and of the critic, evaluated and differentiated by kernels."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,18 +21,16 @@ from sb3_policyflow.kernels.layouts import (
     OBJECTIVE,
     RATIO,
     VALUE,
+    Floats,
     LossOptions,
     LossTargets,
     MLPGradients,
 )
-from sb3_policyflow.kernels.mlp import (
-    MLP,
-    NO_POINTS,
-    gradient_sizes,
-    mlp_input,
-    split_gradients,
-)
+from sb3_policyflow.kernels.mlp import MLP, NO_POINTS, mlp_input, views_like
 from sb3_policyflow.kernels.threads import in_parts, n_parts
+
+UNIT_ENTROPY = 0.5 * math.log(2 * math.pi * math.e)
+"""Entropy of a Gaussian with a standard deviation of 1, in nats."""
 
 
 class LossInputs(NamedTuple):
@@ -89,8 +87,8 @@ class KernelLoss:
         self.scores = scores
         self._critic = KernelView(read_critic)
 
-    def __call__(self, policy: Any, inputs: LossInputs) -> tuple[th.Tensor, LossTerms] | None:
-        """The loss, whose gradients are known already, and its terms.
+    def __call__(self, policy: Any, inputs: LossInputs) -> "EvaluatedLoss | None":
+        """The loss of a minibatch.
 
         :param policy: A policy with a velocity field of kernels and SB3's critic.
         :param inputs: The minibatch.
@@ -100,17 +98,24 @@ class KernelLoss:
         actor = field.parts() if type(field) is KernelVelocityField else "not a field of kernels"
         if isinstance(actor, str) or isinstance(critic, str):
             return None
+        parameters = [inputs.log_std, *actor.parameters, *critic.tensors]
+        if any(parameter._backward_hooks for parameter in parameters):
+            note_fallback("parameters have hooks")
+            return None
+        if any(parameter._post_accumulate_grad_hooks for parameter in parameters):
+            note_fallback("parameters have hooks")
+            return None
         if not are_usable(inputs) or not actor.supports(inputs.points, inputs.features):
             note_fallback("a minibatch is not contiguous float32 on the CPU")
             return None
-        parameters = (*actor.parameters, *critic.tensors)
-        compute = _Minibatch(self, actor, critic, inputs)
-        node: Any = _Loss.apply
-        return node(compute, *inputs[:3], *parameters), compute.terms()
+        return EvaluatedLoss(self, actor, critic, inputs)
 
 
-class _Minibatch:
-    """A minibatch on its way through the kernels: computed at once, gradients included.
+class EvaluatedLoss:
+    """The loss of a minibatch, which has its gradients from the start.
+
+    It can be used in place of the tensor that autograd would go back from: ``item`` and
+    ``backward`` are a tensor's.
 
     :param loss: The loss.
     :param actor: The velocity field.
@@ -121,73 +126,79 @@ class _Minibatch:
     def __init__(
         self, loss: KernelLoss, actor: FieldParts, critic: MLP, inputs: LossInputs
     ) -> None:
-        self.options, self.actor, self.critic = loss.options, actor, critic
-        self.n_samples, self.n_times = inputs.times.shape
-        arrays = LossInputs(*(tensor.detach().numpy() for tensor in inputs))
-        self.embedding = Embedding(actor, arrays.times)
-        self.first = self.embedding.kernel_input(
-            arrays.points.reshape(-1, actor.dim),
-            arrays.features,
-            inputs.times.shape,
-            inputs.times.shape,
-        )
-        self.critic_first = mlp_input(critic, inputs.critic_features)
-        scores = th.stack(loss.scores(th.from_numpy(self.embedding.times)), dim=1)
-        self.targets = LossTargets(
+        self._options, self._actor, self._critic = loss.options, actor, critic
+        self._inputs = inputs
+        self._n_samples, self._n_times = inputs.times.shape
+        arrays = LossInputs(*[tensor.detach().numpy() for tensor in inputs])
+        self._embedding = Embedding(actor, arrays.times)
+        points = arrays.points.reshape(-1, actor.dim)
+        shape = inputs.times.shape
+        self._first = self._embedding.kernel_input(points, arrays.features, shape, shape)
+        self._critic_first = mlp_input(critic, inputs.critic_features)
+        self._targets = LossTargets(
             arrays.actions,
             arrays.endpoints,
             arrays.advantages,
             arrays.reference_velocity.reshape(-1, actor.dim),
-            scores.numpy(),
+            th.stack(loss.scores(th.from_numpy(self._embedding.times)), dim=1).numpy(),
             arrays.log_std,
             arrays.old_log_std,
             arrays.old_values,
             arrays.returns,
         )
-        self.entropy = float(
-            arrays.log_std.sum() + actor.dim * 0.5 * math.log(2 * math.pi * math.e)
+        self._grad_features, self._grad_critic_features = (
+            th.empty_like(features if features.requires_grad else features[:0])
+            for features in inputs[:2]
         )
-        self.grad_features = self._empty_like(inputs.features)
-        self.grad_critic_features = self._empty_like(inputs.critic_features)
         self._compute()
-
-    @staticmethod
-    def _empty_like(features: th.Tensor) -> th.Tensor:
-        return th.empty_like(features if features.requires_grad else features[:0])
+        self.terms = self._terms(arrays.log_std)
 
     def _compute(self) -> None:
-        """Fill gradients and sums, on all threads."""
-        actor, critic = self.actor.network, self.critic
-        self.sizes = gradient_sizes(self.first, actor.tensors)
-        self.critic_sizes = gradient_sizes(self.critic_first, critic.tensors)
-        n_actor, n_critic = sum(self.sizes) + self.actor.dim, sum(self.critic_sizes)
-        flops = 3 * (self.n_times * actor.flops_per_row + critic.flops_per_row)
-        parts = n_parts(self.n_samples, flops)
-        flat = th.zeros(parts, n_actor + n_critic, dtype=th.float32, device="cpu")
-        sums, of_thread = np.zeros((parts, N_SUMS)), flat.numpy()
-        run, targets, options = critic.kernels.loss_gradients, self.targets, self.options
-        features = self.grad_features.numpy()
-        critic_features = self.grad_critic_features.numpy()
+        """Compute gradients and sums, on all threads.
+
+        The gradients of all parameters are one tensor: those of the actor, log_std and critic.
+        """
+        actor, critic = self._actor, self._critic
+        first, critic_first = self._first, self._critic_first
+        n_first = first.weights.size + first.table.size
+        begin, end = actor.n_embedding, sum(p.numel() for p in actor.parameters) + actor.dim
+        weight, bias = critic.held[:2]
+        n_critic, n_critic_first = (
+            sum(p.numel() for p in critic.held),
+            weight.numel() + bias.numel(),
+        )
+        flops = 3 * (self._n_times * actor.network.flops_per_row + critic.flops_per_row)
+        parts = n_parts(self._n_samples, flops)
+        firsts = np.zeros((parts, n_first + n_critic_first), dtype=np.float32)
+        total = th.zeros(parts, end + n_critic, dtype=th.float32, device="cpu")
+        flat, sums = total.numpy(), np.zeros((parts, N_SUMS))
+        features, critic_features = self._grad_features.numpy(), self._grad_critic_features.numpy()
+        run, targets, options = critic.kernels.loss_gradients, self._targets, self._options
 
         def run_part(part: int, start: int, stop: int) -> None:
-            grads = MLPGradients(of_thread[part, :n_actor], NO_POINTS, features)
-            arguments = (targets, options, True, grads, sums[part], start, stop)
-            run(self.first, actor.layout, *arguments)
-            grads = MLPGradients(of_thread[part, n_actor:], NO_POINTS, critic_features)
-            arguments = (targets, options, False, grads, sums[part], start, stop)
-            run(self.critic_first, critic.layout, *arguments)
+            of_first, others = firsts[part, :n_first], flat[part, begin:end]
+            grads = MLPGradients(of_first, others, NO_POINTS, features)
+            rows = (sums[part], start, stop)
+            run(first, actor.network.layout, targets, options, True, grads, *rows)
+            of_first, others = firsts[part, n_first:], flat[part, end + n_critic_first :]
+            grads = MLPGradients(of_first, others, NO_POINTS, critic_features)
+            run(critic_first, critic.layout, targets, options, False, grads, *rows)
 
-        in_parts(self.n_samples, parts, run_part)
-        self.flat = flat[0] if parts == 1 else flat.sum(0)
-        self.flat[n_actor - self.actor.dim : n_actor] -= options.ent_coef  # entropy by log_std
-        self.sums = sums.sum(axis=0)
-        self.sums[LARGEST] = sums[:, LARGEST].max()
+        in_parts(self._n_samples, parts, run_part)
+        self._sums = sums.sum(axis=0)
+        self._sums[LARGEST] = sums[:, LARGEST].max()
+        self._flat = total[0] if parts == 1 else total.sum(0)
+        flat, of_first = self._flat.numpy(), firsts[0] if parts == 1 else firsts.sum(axis=0)
+        self._embedding.backward(of_first[:n_first], flat[:begin])
+        flat[end - actor.dim : end] -= options.ent_coef
+        of_weight, of_bias = np.split(of_first[n_first:], [weight.numel()])
+        flat[end : end + weight.numel()] = of_weight.reshape(weight.T.shape).T.reshape(-1)
+        flat[end + weight.numel() : end + n_critic_first] = of_bias
 
-    def terms(self) -> LossTerms:
-        """What the loss consists of."""
-        sums, options, n = self.sums, self.options, self.n_samples
-        n_rows = n * self.n_times
-        n_surrogates = n if options.averages_shift else n_rows
+    def _terms(self, log_std: Floats) -> LossTerms:
+        sums, n = self._sums.tolist(), self._n_samples
+        n_rows = n * self._n_times
+        n_surrogates = n if self._options.averages_shift else n_rows
         return LossTerms(
             policy_gradient_loss=-sums[OBJECTIVE] / n_surrogates,
             clip_fraction=sums[CLIPPED] / n_surrogates,
@@ -196,63 +207,37 @@ class _Minibatch:
             kl=sums[KL] / n_surrogates,
             brownian_loss=sums[BROWNIAN] / n_rows,
             velocity_change=sums[CHANGE] / n_rows,
-            entropy=self.entropy,
+            entropy=float(log_std.sum()) + len(log_std) * UNIT_ENTROPY,
             value_loss=sums[VALUE] / n,
         )
 
-    def loss(self) -> float:
-        """The sum of the losses."""
-        terms, options = self.terms(), self.options
+    def item(self) -> float:
+        """The loss."""
+        terms, options = self.terms, self._options
         loss = terms.policy_gradient_loss + options.vf_coef * terms.value_loss
         loss -= options.ent_coef * terms.entropy
         if options.brownian_coef != 0.0:  # it may be infinite
             loss += options.brownian_coef * terms.brownian_loss
         return loss
 
-    def scale_gradients(self, factor: float) -> None:
-        """Multiply all gradients by a number."""
-        for tensor in (self.flat, self.grad_features, self.grad_critic_features):
-            tensor.mul_(factor)
+    def backward(self, inputs: Sequence[th.Tensor] | None = None) -> None:
+        """Add the gradients to those that the parameters have.
 
-    def gradients(self) -> list[th.Tensor | None]:
-        """Gradients of both features, log_std, and the parameters of actor and critic."""
-        sizes = [sum(self.sizes), self.actor.dim, sum(self.critic_sizes)]
-        of_actor, log_std, of_critic = th.split(self.flat, sizes)
-        actor = split_gradients(of_actor, self.sizes, self.first, self.actor.network.tensors)
-        critic = split_gradients(
-            of_critic, self.critic_sizes, self.critic_first, self.critic.tensors
-        )
-        return [
-            self.grad_features if len(self.grad_features) else None,
-            self.grad_critic_features if len(self.grad_critic_features) else None,
-            log_std,
-            *self.embedding.backward(actor),
-            *actor.others,
-            critic.weights.T.contiguous(),
-            critic.table[0],
-            *critic.others,
-        ]
-
-
-class _Loss(th.autograd.Function):
-    """The loss of a minibatch as a node of autograd's graph."""
-
-    @staticmethod
-    def forward(ctx: Any, minibatch: _Minibatch, *differentiable: th.Tensor) -> th.Tensor:
-        ctx.minibatch = minibatch
-        ctx.save_for_backward(*differentiable)  # none of which may change before the backward pass
-        return th.tensor(minibatch.loss(), dtype=th.float32, device="cpu")
-
-    @staticmethod
-    @th.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_output: th.Tensor) -> Any:
-        _ = ctx.saved_tensors  # checks that none has changed
-        minibatch, ctx.minibatch = ctx.minibatch, None
-        if minibatch is None:
-            raise RuntimeError(
-                "This loss gives its gradients away: it has no second backward pass."
-            )
-        scale = grad_output.item()
-        if scale != 1.0:
-            minibatch.scale_gradients(scale)
-        return None, *minibatch.gradients()
+        :param inputs: The parameters; all if not given.
+        """
+        actor, critic = self._actor, self._critic
+        tensors = [*actor.parameters, self._inputs.log_std, *critic.tensors]
+        gradients = [*views_like(tensors, self._flat)]
+        tensors += self._inputs[:2]
+        gradients += [self._grad_features, self._grad_critic_features]
+        wanted = None if inputs is None else set(inputs)
+        functions: list[tuple[th.Tensor, th.Tensor]] = []
+        for tensor, gradient in zip(tensors, gradients, strict=True):
+            if not tensor.requires_grad:
+                continue
+            if not tensor.is_leaf:
+                functions.append((tensor, gradient))
+            elif wanted is None or tensor in wanted:
+                tensor.grad = gradient if tensor.grad is None else tensor.grad + gradient
+        if functions:
+            th.autograd.backward(*zip(*functions, strict=True), inputs=inputs)

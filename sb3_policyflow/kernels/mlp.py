@@ -1,7 +1,7 @@
 """MLPs evaluated and differentiated by kernels."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -99,14 +99,6 @@ def read_mlp(kernels: Kernels, inspector: ModuleInspector, modules: Iterable[nn.
     return MLP(kernels, modules, layers, activations.pop())
 
 
-class Gradients(NamedTuple):
-    """Gradients of an MLP: of first weights and table, see :class:`KernelInput`, other layers."""
-
-    weights: th.Tensor
-    table: th.Tensor
-    others: list[th.Tensor]
-
-
 class Evaluation:
     """An evaluation of an MLP, forward and backward.
 
@@ -147,7 +139,7 @@ class Evaluation:
         grad_outputs: th.Tensor,
         grad_points: Floats,
         grad_features: Floats,
-    ) -> Gradients:
+    ) -> tuple[th.Tensor, list[th.Tensor]]:
         """Differentiate.
 
         :param saved: What :meth:`forward` saved.
@@ -155,22 +147,25 @@ class Evaluation:
         :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
         :param grad_points: Filled; shape (n, n_points), or empty if it is not wanted.
         :param grad_features: Filled; shape (m, n_features), or empty if it is not wanted.
+        :return: Gradients of the first layer's weights and table, flat, and of other parameters.
         """
         network, first = self._network, self._first
-        sizes = gradient_sizes(first, parameters)
+        n_first = first.weights.size + first.table.size
+        n_others = sum(parameter.numel() for parameter in parameters[2:])
         # Each thread adds up its own.
-        flat = th.zeros(self._n_parts, sum(sizes), dtype=th.float32, device="cpu")
+        flat = th.zeros(self._n_parts, n_first + n_others, dtype=th.float32, device="cpu")
         of_thread = flat.numpy()
         layout, (values, derivatives) = network.layout_of(parameters), saved.numpy()
         outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
 
         def run_part(part: int, start: int, stop: int) -> None:
-            gradients = MLPGradients(of_thread[part], grad_points, grad_features)
+            of_first, of_others = of_thread[part, :n_first], of_thread[part, n_first:]
+            gradients = MLPGradients(of_first, of_others, grad_points, grad_features)
             run(first, layout, values, derivatives, outputs, gradients, start, stop)
 
         self._in_parts(run_part)
         total = flat[0] if self._n_parts == 1 else flat.sum(0)
-        return split_gradients(total, sizes, first, parameters)
+        return total[:n_first], views_like(parameters[2:], total[n_first:])
 
     def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
         """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both passes.
@@ -186,31 +181,13 @@ class Evaluation:
         )
 
 
-def gradient_sizes(first: KernelInput, parameters: Sequence[th.Tensor]) -> list[int]:
-    """How many numbers the parts of an MLP's gradients have, see :class:`MLPGradients`.
+def views_like(tensors: Sequence[th.Tensor], flat: th.Tensor) -> list[th.Tensor]:
+    """Views of a tensor, one behind the other, with the shapes of others.
 
-    :param first: The first layer.
-    :param parameters: Weight and bias of each layer.
+    >>> [view.shape for view in views_like([th.ones(2, 3), th.ones(4)], th.arange(10))]
+    [torch.Size([2, 3]), torch.Size([4])]
     """
-    return [first.weights.size, first.table.size, *(p.numel() for p in parameters[2:])]
-
-
-def split_gradients(
-    flat: th.Tensor, sizes: list[int], first: KernelInput, parameters: Sequence[th.Tensor]
-) -> Gradients:
-    """The parts of an MLP's gradients, views of the tensor that has them all.
-
-    :param flat: The gradients.
-    :param sizes: Their :func:`gradient_sizes`.
-    :param first: The first layer.
-    :param parameters: Weight and bias of each layer.
-    """
-    weights, table, *others = th.split(flat, sizes)
-    return Gradients(
-        weights.view(first.weights.shape),
-        table.view(first.table.shape),
-        [part.view(p.shape) for part, p in zip(others, parameters[2:], strict=True)],
-    )
+    return list(th._C._nn.unflatten_dense_tensors(flat, list(tensors)))
 
 
 class _MLPEvaluation(th.autograd.Function):
@@ -231,15 +208,16 @@ class _MLPEvaluation(th.autograd.Function):
             module = nn.Sequential(*ctx.network.modules)
             return None, *differentiable_gradients(module, [inputs], parameters, grad_outputs)
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
-        gradients = ctx.evaluation.backward(
+        of_first, others = ctx.evaluation.backward(
             saved, parameters, grad_outputs, NO_POINTS, grad_inputs.numpy()
         )
+        weight, bias = parameters[:2]
         return (
             None,
             grad_inputs if ctx.needs_input_grad[1] else None,
-            gradients.weights.T.contiguous(),
-            gradients.table[0],
-            *gradients.others,
+            of_first[: weight.numel()].view(weight.T.shape).T.contiguous(),
+            of_first[weight.numel() :].view_as(bias),
+            *others,
         )
 
 

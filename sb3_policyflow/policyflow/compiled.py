@@ -64,10 +64,9 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         evaluated = loss(policy, inputs)
         if evaluated is None:
             return None
-        total, terms = evaluated
-        means = terms._asdict()
+        means = evaluated.terms._asdict()
         kl, maxima = th.tensor(means.pop("kl")), {"log_ratio_max": means.pop("log_ratio_max")}
         means["entropy_loss"] = -means.pop("entropy")
-        return CompiledTerms(total, kl, means, maxima)
+        return CompiledTerms(evaluated, kl, means, maxima)
 
     return compiled_loss

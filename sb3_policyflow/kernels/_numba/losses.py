@@ -20,7 +20,6 @@ from sb3_policyflow.kernels._numba.mlp import (
     first_layer,
     first_layer_backward,
     hidden_layers,
-    n_of_first_layer,
     rows_of_a_block,
     rows_of_a_sample,
     total,
@@ -65,7 +64,7 @@ def loss_gradients(
     :param targets: What its outputs should be.
     :param options: Options of the losses.
     :param is_actor: Whether it is the velocity field.
-    :param gradients: Added to. Behind the gradients of an actor's layers follow those of log_std.
+    :param gradients: Added to. Behind those of an actor's other layers follows that of log_std.
     :param sums: Added to, see :data:`~sb3_policyflow.kernels.layouts.N_SUMS`.
     :param start: The first sample.
     :param stop: The sample behind the last.
@@ -78,9 +77,8 @@ def loss_gradients(
     scratch, hidden = backward_scratch(network, most), arranged(network)
     weight = matrix(network.weights[-1], n_outputs, widths[-1])
     bias = vector(network.biases[-1], n_outputs)
-    n_layers = gradients.parameters.size - (n_outputs if is_actor else 0)
-    of_layers = gradients.parameters[n_of_first_layer(first) : n_layers]
-    of_log_std = gradients.parameters[n_layers:]
+    n_others = gradients.others.size - (n_outputs if is_actor else 0)
+    of_layers, of_log_std = gradients.others[:n_others], gradients.others[n_others:]
     for begin in range(start * group, stop * group, block_rows):
         end = min(begin + block_rows, stop * group)
         rows = end - begin

@@ -125,9 +125,9 @@ def first_layer_backward(
     :param grad: Those of what it yields, shape (end - begin, h).
     """
     (n_points, n_features), width = (first.points.shape[1], first.features.shape[1]), grad.shape[1]
-    n_inputs, n_entries, group = n_points + n_features, len(first.table), rows_of_a_sample(first)
-    weights = gradients.parameters[: n_inputs * width].reshape((n_inputs, width))
-    table = gradients.parameters[n_inputs * width : (n_inputs + n_entries) * width]
+    n_inputs, group = n_points + n_features, rows_of_a_sample(first)
+    weights = gradients.first[: n_inputs * width].reshape((n_inputs, width))
+    table = gradients.first[n_inputs * width :]
     for row in range(begin, end):
         entry = first.entries[row] if first.entries.size > 0 else 0
         add(grad[row - begin], table[entry * width : (entry + 1) * width])
@@ -219,16 +219,10 @@ def backward(
             values[begin * n_saved : end * n_saved],
             derivatives[begin * n_saved : end * n_saved],
             grad_outputs[begin:end],
-            gradients.parameters[n_of_first_layer(first) :],
+            gradients.others,
             scratch,
         )
         first_layer_backward(first, begin, end, grad, gradients)
-
-
-@inner
-def n_of_first_layer(first: KernelInput) -> int:
-    """How many gradients the first layer has: those of its weights and table."""
-    return (first.weights.shape[0] + first.table.shape[0]) * first.weights.shape[1]
 
 
 @inner
