@@ -175,11 +175,8 @@ class UpdateMetrics:
 
     @staticmethod
     def _append(values: list[Any], value: th.Tensor | float) -> None:
-        if not isinstance(value, th.Tensor):
-            values.append(value)
-            return
-        values.append(value.detach())
-        if len(values) == 32:
+        values.append(value.detach() if isinstance(value, th.Tensor) else value)
+        if len(values) == 32 and isinstance(value, th.Tensor):
             # Many small tensors would keep the memory between them from being used again.
             values[:] = [_joined(values)]
 

@@ -56,6 +56,7 @@ class FieldParts:
         self.embedding = [*time.tensors, *observation, *network.layers[0]]
         self.n_embedding = sum(tensor.numel() for tensor in self.embedding)
         self.parameters = [*self.embedding, *network.tensors[2:]]
+        self.n_parameters = sum(tensor.numel() for tensor in self.parameters)
         self.tensors = [frequencies, *self.parameters]
         embedding = [*time.held, *(tensor.detach() for tensor in observation), *network.held[:2]]
         self.held = [frequencies.detach(), *embedding, *network.held[2:]]

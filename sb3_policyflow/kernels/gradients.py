@@ -1,7 +1,9 @@
 """Gradients clipped, and steps of Adam taken, by kernels."""
 
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
@@ -29,6 +31,16 @@ def clip_gradients_in_place(grads: Sequence[th.Tensor], max_norm: float) -> floa
     return float(kernels.clip(addresses(grads), sizes, max_norm))
 
 
+class _AdamReading(NamedTuple):
+    """Tensors of a group that a kernel can work on, and where they were when that was checked."""
+
+    tensors: list[th.Tensor]
+    places: list[int]
+
+
+_readings: WeakKeyDictionary[th.optim.Optimizer, list[_AdamReading]] = WeakKeyDictionary()
+
+
 def step_in_place(optimizer: th.optim.Optimizer) -> bool:
     """Take a step of Adam or AdamW, in the state that torch's own step has made and goes on with.
 
@@ -38,13 +50,30 @@ def step_in_place(optimizer: th.optim.Optimizer) -> bool:
     kernels = load_kernels()
     if isinstance(kernels, str) or why_torch_must_work() or _has_more_to_do(optimizer):
         return False
-    groups = [_adam_tensors(optimizer, group) for group in optimizer.param_groups]
-    if any(tensors is None for tensors in groups):
+    found = [_adam_tensors(optimizer, group) for group in optimizer.param_groups]
+    groups = [tensors for tensors in found if tensors is not None]
+    if len(groups) < len(found):
         return False
-    for group, tensors in zip(optimizer.param_groups, groups, strict=True):
-        if tensors:
-            _take_step(kernels, group, tensors)
+    readings = [_AdamReading(tensors, [t.data_ptr() for t in tensors]) for tensors in groups]
+    if not _are_known(optimizer, readings):
+        if not all(are_usable(reading.tensors) for reading in readings):
+            return False
+        _readings[optimizer] = readings
+    for group, reading in zip(optimizer.param_groups, readings, strict=True):
+        gradients = [p.grad for p in group["params"] if p.grad is not None]
+        if not are_usable(gradients):
+            return False
+        _take_step(kernels, group, gradients, reading.places)
     return True
+
+
+def _are_known(optimizer: th.optim.Optimizer, readings: list[_AdamReading]) -> bool:
+    """Whether all tensors, and their memory, are those that were checked before."""
+    known = _readings.get(optimizer, [])
+    return len(known) == len(readings) and all(
+        old.places == new.places and all(map(operator.is_, old.tensors, new.tensors))
+        for old, new in zip(known, readings, strict=True)
+    )
 
 
 def _has_more_to_do(optimizer: Any) -> bool:
@@ -60,25 +89,23 @@ def _has_more_to_do(optimizer: Any) -> bool:
     return not is_adam or any(hooks) or "step" in optimizer.__dict__
 
 
-def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[list[th.Tensor]] | None:
-    """Gradients, parameters, both moments and steps of a group; None if kernels cannot work."""
+def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[th.Tensor] | None:
+    """Parameters with gradients, both moments and steps of a group; None if there are none yet."""
     numbers = (group["lr"], *group["betas"])
     has_numbers = all(isinstance(number, float | int) for number in numbers)
     if not has_numbers or any(group[name] != value for name, value in PLAIN_ADAM.items()):
         return None
-    rows = []
-    for parameter in group["params"]:
-        grad = parameter.grad
-        if grad is not None:
-            state = optimizer.state.get(parameter)
-            if not state or grad.shape != parameter.shape:
-                return None
-            rows.append((grad, parameter, state["exp_avg"], state["exp_avg_sq"], state["step"]))
-    tensors = [list(column) for column in zip(*rows, strict=True)]
-    return tensors if all(are_usable(column) for column in tensors) else None
+    parameters = [p for p in group["params"] if p.grad is not None]
+    states = [optimizer.state.get(parameter) for parameter in parameters]
+    if not all(states):
+        return None
+    kinds = ("exp_avg", "exp_avg_sq", "step")
+    return [*parameters, *(state[kind] for kind in kinds for state in states)]
 
 
-def _take_step(kernels: Kernels, group: dict[str, Any], tensors: list[list[th.Tensor]]) -> None:
+def _take_step(
+    kernels: Kernels, group: dict[str, Any], gradients: list[th.Tensor], places: list[int]
+) -> None:
     beta1, beta2 = group["betas"]
     options = AdamOptions(
         float(group["lr"]),
@@ -88,6 +115,6 @@ def _take_step(kernels: Kernels, group: dict[str, Any], tensors: list[list[th.Te
         float(group["weight_decay"]),
         bool(group.get("decoupled_weight_decay", False)),
     )
-    places = np.array([addresses(column) for column in tensors])
-    sizes = np.array([parameter.numel() for parameter in tensors[1]])
-    kernels.adam(places, sizes, options)
+    table = np.array([*(grad.data_ptr() for grad in gradients), *places])
+    sizes = np.array([grad.numel() for grad in gradients])
+    kernels.adam(table.reshape(5, -1), sizes, options)

@@ -99,10 +99,7 @@ class KernelLoss:
         if isinstance(actor, str) or isinstance(critic, str):
             return None
         parameters = [inputs.log_std, *actor.parameters, *critic.tensors]
-        if any(parameter._backward_hooks for parameter in parameters):
-            note_fallback("parameters have hooks")
-            return None
-        if any(parameter._post_accumulate_grad_hooks for parameter in parameters):
+        if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters):
             note_fallback("parameters have hooks")
             return None
         if not are_usable(inputs) or not actor.supports(inputs.points, inputs.features):
@@ -129,7 +126,7 @@ class EvaluatedLoss:
         self._options, self._actor, self._critic = loss.options, actor, critic
         self._inputs = inputs
         self._n_samples, self._n_times = inputs.times.shape
-        arrays = LossInputs(*[tensor.detach().numpy() for tensor in inputs])
+        arrays: Any = LossInputs._make(tensor.detach().numpy() for tensor in inputs)
         self._embedding = Embedding(actor, arrays.times)
         points = arrays.points.reshape(-1, actor.dim)
         shape = inputs.times.shape
@@ -161,16 +158,12 @@ class EvaluatedLoss:
         actor, critic = self._actor, self._critic
         first, critic_first = self._first, self._critic_first
         n_first = first.weights.size + first.table.size
-        begin, end = actor.n_embedding, sum(p.numel() for p in actor.parameters) + actor.dim
-        weight, bias = critic.held[:2]
-        n_critic, n_critic_first = (
-            sum(p.numel() for p in critic.held),
-            weight.numel() + bias.numel(),
-        )
+        begin, end = actor.n_embedding, actor.n_parameters + actor.dim
+        n_critic_first = critic_first.weights.size + critic_first.table.size
         flops = 3 * (self._n_times * actor.network.flops_per_row + critic.flops_per_row)
         parts = n_parts(self._n_samples, flops)
         firsts = np.zeros((parts, n_first + n_critic_first), dtype=np.float32)
-        total = th.zeros(parts, end + n_critic, dtype=th.float32, device="cpu")
+        total = th.zeros(parts, end + critic.n_parameters, dtype=th.float32, device="cpu")
         flat, sums = total.numpy(), np.zeros((parts, N_SUMS))
         features, critic_features = self._grad_features.numpy(), self._grad_critic_features.numpy()
         run, targets, options = critic.kernels.loss_gradients, self._targets, self._options
@@ -185,15 +178,18 @@ class EvaluatedLoss:
             run(critic_first, critic.layout, targets, options, False, grads, *rows)
 
         in_parts(self._n_samples, parts, run_part)
-        self._sums = sums.sum(axis=0)
-        self._sums[LARGEST] = sums[:, LARGEST].max()
-        self._flat = total[0] if parts == 1 else total.sum(0)
-        flat, of_first = self._flat.numpy(), firsts[0] if parts == 1 else firsts.sum(axis=0)
+        self._sums, of_first, self._flat = sums[0], firsts[0], total[0]
+        if parts > 1:
+            self._sums, of_first, self._flat = sums.sum(axis=0), firsts.sum(axis=0), total.sum(0)
+            self._sums[LARGEST] = sums[:, LARGEST].max()
+        flat, shape = self._flat.numpy(), critic_first.weights.shape
         self._embedding.backward(of_first[:n_first], flat[:begin])
         flat[end - actor.dim : end] -= options.ent_coef
-        of_weight, of_bias = np.split(of_first[n_first:], [weight.numel()])
-        flat[end : end + weight.numel()] = of_weight.reshape(weight.T.shape).T.reshape(-1)
-        flat[end + weight.numel() : end + n_critic_first] = of_bias
+        weight_end = n_first + critic_first.weights.size
+        of_weight, of_bias = of_first[n_first:weight_end].reshape(shape), of_first[weight_end:]
+        of_critic = flat[end : end + n_critic_first]
+        of_critic[: of_weight.size].reshape(shape[::-1])[:] = of_weight.T
+        of_critic[of_weight.size :] = of_bias
 
     def _terms(self, log_std: Floats) -> LossTerms:
         sums, n = self._sums.tolist(), self._n_samples
@@ -231,13 +227,15 @@ class EvaluatedLoss:
         tensors += self._inputs[:2]
         gradients += [self._grad_features, self._grad_critic_features]
         wanted = None if inputs is None else set(inputs)
-        functions: list[tuple[th.Tensor, th.Tensor]] = []
+        roots, root_gradients = list[th.Tensor](), list[th.Tensor]()
         for tensor, gradient in zip(tensors, gradients, strict=True):
             if not tensor.requires_grad:
                 continue
             if not tensor.is_leaf:
-                functions.append((tensor, gradient))
+                roots.append(tensor)
+                root_gradients.append(gradient)
             elif wanted is None or tensor in wanted:
                 tensor.grad = gradient if tensor.grad is None else tensor.grad + gradient
-        if functions:
-            th.autograd.backward(*zip(*functions, strict=True), inputs=inputs)
+        behind = None if wanted is None else list(wanted.difference(tensors))
+        if roots and behind != []:
+            th.autograd.backward(roots, root_gradients, inputs=behind)

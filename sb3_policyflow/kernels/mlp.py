@@ -57,6 +57,7 @@ class MLP:
         self.activation = activation
         self.tensors = [tensor for layer in layers for tensor in layer]
         self.held = [tensor.detach() for tensor in self.tensors]
+        self.n_parameters = sum(tensor.numel() for tensor in self.held)
         self.shapes = [tensor.shape for tensor in self.held]
         self.places = [tensor.data_ptr() for tensor in self.held]
         weights, biases = self.held[::2], self.held[1::2]

@@ -53,6 +53,8 @@ class PolicyFlowUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: PolicyFlowPolicy
+
     def __init__(self, algorithm: "PolicyFlow", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
         policy = algorithm.policy
