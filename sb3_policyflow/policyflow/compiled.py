@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.losses import SURROGATES, clipped_surrogate
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.update import CompiledLoss, CompiledTerms
 from sb3_policyflow.flows import Interpolant
@@ -22,12 +23,14 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     :return: None if it has terms that no kernel knows.
     """
     policy, interpolant = update.policy, update.flow.interpolant
-    has_known_terms = update.trust_region == "ppo" and update.uniform_targets is None
     has_known_formulas = (
-        type(policy).values is FlowPolicy.values
+        SURROGATES[update.trust_region] is clipped_surrogate
+        and update.uniform_targets is None
+        and isinstance(update.clip_range, float)
+        and type(policy).values is FlowPolicy.values
         and type(interpolant).brownian_residual is Interpolant.brownian_residual
     )
-    if not (has_known_terms and has_known_formulas and isinstance(update.clip_range, float)):
+    if not has_known_formulas:
         return None
     unbounded = math.inf
     options = LossOptions(
