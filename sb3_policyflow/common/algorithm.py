@@ -50,6 +50,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
+    former_values: ClassVar[Mapping[str, Any]] = {"has_former_defaults": True}
+    has_former_defaults: bool = False
+    """Whether a file of version 0.1 was loaded: what it does not say, had other defaults."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
@@ -63,7 +66,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name in names.settable_options(cls.policy_base):
+        for name in {"random_latents", *names.settable_options(cls.policy_base)}:
             if not hasattr(cls, name):
                 setattr(cls, name, options.PolicyOption(name))
 
@@ -115,6 +118,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
         self.policy_options = policy_options
+        self.has_former_defaults = False  # an attribute of files
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
         self._adaptive_start: float | None = None
@@ -143,6 +147,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         options.read_loaded_options(self)
+        names.keep_former_defaults(self)
         options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space

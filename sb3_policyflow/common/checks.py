@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 
 from sb3_policyflow.common.buffers import (
@@ -19,6 +20,10 @@ from sb3_policyflow.flows.choices import choose
 
 Check = Callable[[str, object], object]
 """``check(name, value)`` raises a ``ValueError`` that says what ``name`` must be."""
+
+SHORTEST_MEANINGLESS = 200.0
+"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
+others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
 
 
 def check_options(options: object) -> None:
@@ -250,3 +255,17 @@ def warn_of_batches(batch_size: int, n_steps: int, n_envs: int) -> None:
             f"{buffer_size % batch_size} samples. Use a factor of {buffer_size}.",
             stacklevel=4,
         )
+
+
+def half_ranges(action_space: spaces.Space[Any]) -> NDArray[np.float32]:
+    """Half the distance of the bounds of actions; infinity where they are none that mean something.
+
+    :param action_space: A Box.
+    :return: Shape (action_dim,).
+    """
+    assert isinstance(action_space, spaces.Box)
+    with np.errstate(over="ignore"):
+        widths = action_space.high.astype(np.float64) - action_space.low.astype(np.float64)
+    widths[widths >= SHORTEST_MEANINGLESS] = np.inf
+    # A dimension that cannot move has a little noise, too: its logarithm must be finite.
+    return np.maximum(widths / 2, 1e-6).astype(np.float32).flatten()

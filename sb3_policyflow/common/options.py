@@ -88,6 +88,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
 
 FORMER_NAMES = {
     "_n_rollouts": "n_rollouts",
+    "random_latents": "deterministic_action",
     "lr_adaptation": "lr_adaptation_kwargs.interval",
     "lr_factor": "lr_adaptation_kwargs.factor",
     "lr_bounds": "lr_adaptation_kwargs.bounds",

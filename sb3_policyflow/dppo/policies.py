@@ -42,9 +42,6 @@ class DPPORecord(NamedTuple):
     means: th.Tensor
 
 
-SHORTEST_MEANINGLESS = 200.0
-"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
-others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
 ADVICE = (
     "use process='flow', which does not scale, or give the environment bounds that mean something "
     "(gymnasium.wrappers.TransformAction)"
@@ -76,7 +73,7 @@ def warn_of_wide_bounds(policy: "DPPOPolicy") -> None:
     if policy.process != "ddpm":
         return
     width = (box.high - box.low).max()
-    if width >= SHORTEST_MEANINGLESS:
+    if width >= checks.SHORTEST_MEANINGLESS:
         warnings.warn(
             f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
             f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "
@@ -171,6 +168,10 @@ class DPPOPolicy(FlowPolicy):
                 self.base_mlp_extractor = deepcopy(self.mlp_extractor).requires_grad_(False)
 
     @property
+    def latent_scale(self) -> float:
+        return 1.0
+
+    @property
     def n_evaluations_per_action(self) -> int:
         return self.n_denoising_steps
 
@@ -250,7 +251,7 @@ class DPPOPolicy(FlowPolicy):
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, DPPORecord]:
-        """Draw actions; the deterministic one starts at 0 and each step goes to its mean."""
+        """Draw actions; in deterministic ones each step goes to its mean."""
         latents = self.draw_latents(features, deterministic)
         points, means = self._chain(latents, features, is_noisy=not deterministic)
         record = DPPORecord(

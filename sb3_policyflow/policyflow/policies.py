@@ -21,10 +21,14 @@ class PolicyFlowOptions(FlowOptions, total=False):
     interpolant: str
     n_flow_steps: int
     solver: str
-    latent_std: float
+    latent_std: float | None
     gaussian: bool
-    log_std_init: float
+    log_std_init: float | None
     log_std_bounds: tuple[float, float] | None
+
+
+LATENT_STD, NOISE_STD = 0.2, 0.4
+"""Initial standard deviations of latents and noise, in half the distance of the actions' bounds."""
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -39,7 +43,7 @@ def check_latents(policy: "PolicyFlowPolicy") -> None:
 
     :raises ValueError: With what to leave out.
     """
-    if policy.latent_std == 1.0:
+    if policy.latent_std in (None, 1.0):
         return
     if policy.gaussian:
         raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
@@ -74,12 +78,14 @@ class PolicyFlowPolicy(BaseFlowPolicy):
     :raises ValueError: If an option is not supported.
     """
 
+    default_latent_std: th.Tensor
+
     option_checks: ClassVar[Mapping[str, checks.Check]] = {
         "interpolant": checks.one_of(INTERPOLANTS),
         "n_flow_steps": checks.at_least(1),
         "solver": checks.one_of(SOLVERS),
-        "latent_std": checks.positive,
-        "log_std_init": checks.finite,
+        "latent_std": checks.or_none(checks.positive),
+        "log_std_init": checks.or_none(checks.finite),
         "log_std_bounds": checks.or_none(checks.bounds),
     }
     combination_checks = (check_latents,)
@@ -95,9 +101,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         interpolant: str = "rectified",
         n_flow_steps: int = 12,
         solver: str = "midpoint",
-        latent_std: float = 1.0,
+        latent_std: float | None = None,
         gaussian: bool = False,
-        log_std_init: float = 0.0,
+        log_std_init: float | None = None,
         log_std_bounds: tuple[float, float] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -106,17 +112,28 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self.solver = solver
         self.latent_std = latent_std
         self.gaussian = gaussian
-        self.log_std_init = log_std_init
+        self.log_std_init: Any = log_std_init
         self.log_std_bounds = log_std_bounds
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         # SB3 has set both to the defaults of its own actor.
         self.log_std_init = log_std_init
-        nn.init.constant_(self.log_std, log_std_init)
+        if log_std_init is not None:
+            nn.init.constant_(self.log_std, log_std_init)
         self.keep_within_bounds()
 
     def _build_actor(self) -> None:
         self.velocity = self._make_velocity_field()
-        self.log_std = nn.Parameter(th.zeros(self.action_dim))
+        half_ranges = th.from_numpy(checks.half_ranges(self.action_space))
+        latent_stds = (LATENT_STD * half_ranges).nan_to_num(posinf=1.0)
+        self.register_buffer("default_latent_std", latent_stds, persistent=False)
+        self.log_std = nn.Parameter((NOISE_STD * half_ranges).nan_to_num(posinf=1.0).log())
+
+    @property
+    def latent_scale(self) -> float | th.Tensor:
+        if self.latent_std is not None:
+            return self.latent_std
+        is_stochastic = INTERPOLANTS[self.interpolant].stochastic
+        return 1.0 if is_stochastic else self.default_latent_std
 
     @property
     def flow(self) -> Flow:
@@ -148,13 +165,11 @@ class PolicyFlowPolicy(BaseFlowPolicy):
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
-        """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have z = 0, n = 0."""
+        """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have no noise n."""
         if self.gaussian:
             latents = features.new_zeros(len(features), self.action_dim)
         else:
             latents = self.draw_latents(features, deterministic)
-            if self.latent_std != 1.0:
-                latents = self.latent_std * latents
         endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:

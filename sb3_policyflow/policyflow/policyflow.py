@@ -121,7 +121,7 @@ class PolicyFlowUpdate(FlowUpdate):
         :param velocity: v there, shape (n, k, action_dim).
         """
         eta = self.flow.interpolant.brownian_residual(
-            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.policy.latent_std
+            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.policy.latent_scale
         )
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)

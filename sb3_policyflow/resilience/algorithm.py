@@ -23,7 +23,7 @@ from sb3_policyflow.resilience.collection import (
     terminal_observations,
     time_limits,
 )
-from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
+from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
 from sb3_policyflow.resilience.saving import RandomStates, ResumeState
 from sb3_policyflow.resilience.workers import watch_workers
@@ -69,6 +69,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
+    former_values: ClassVar[Mapping[str, Any]] = {}
+    """Values of attributes that files of earlier versions do not have."""
     unsaved: ClassVar[tuple[str, ...]] = ("_callback", "_step_checks", "_saved_random_states")
     """Attributes that no file has."""
 
@@ -240,6 +242,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         """
         with opened(path, suffix="zip") as file:
             check_archive(file, path, members=("data", "policy.pth"))
+            present = saved_attributes(file)
+            missing = {k: v for k, v in cls.former_values.items() if k not in present}
+            kwargs = {**missing, **kwargs}
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
