@@ -75,6 +75,8 @@ class ActionModule(nn.Module):
         super().__init__()
         self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
         self.policy.set_training_mode(False)
+        if self.policy.deterministic_action == "drawn":
+            self.policy.deterministic_action = "mode"
         self.normalizers = nn.ModuleDict(_normalizers(self.policy.observation_space, normalize))
         box = self.policy.action_space
         assert isinstance(box, spaces.Box)
@@ -86,13 +88,14 @@ class ActionModule(nn.Module):
 
         :param observations: Observations of the environment, with images channels first: a tensor
             (n, ...), or a dictionary of tensors.
-        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
-            PolicyFlow's latents have standard deviation ``latent_std``.
+        :param latents: z, where the flow starts, shape (n, action_dim); those of the deterministic
+            action if not given. Drawn ones are normal with standard deviation
+            ``policy.latent_scale``.
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
         if latents is None:
-            latents = features.new_zeros(features.shape[0], self.policy.action_dim)
+            latents = self.policy.draw_latents(features, deterministic=True)
         actions = self.policy.transport(latents, features).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
@@ -154,7 +157,8 @@ def export(
     :param path: The file, which ends in ".onnx" or ".pt2".
     :param normalize: The ``VecNormalize`` that the policy was trained with. If it is missing, the
         file takes observations that are normalized already, and returns wrong actions for others.
-    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise z = 0.
+    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise they are
+        those of the deterministic action.
     :raises ValueError: If ``path`` has another suffix.
     """
     path = Path(path)

@@ -18,7 +18,7 @@ FORMER_VALUES: dict[tuple[str, object], str] = {
 }
 """Present values of options by option and former value."""
 
-FORMER_DEFAULTS = {"latent_std": 1.0, "log_std_init": 0.0, "deterministic_action": "zero"}
+FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
 """Defaults of policies in version 0.1, where they are others now."""
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."

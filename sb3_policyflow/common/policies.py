@@ -60,7 +60,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
     :param embedding_dim: Size of the time and observation embeddings.
     :param frequencies: Frequencies of the time embedding, or how many to draw.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
-    :param initialization: "glorot", "glorot_zero_output" or "zero".
+    :param initialization: "orthogonal", "glorot", "glorot_zero_output" or "zero".
     :param deterministic_action: What ``predict(deterministic=True)`` returns: "mode", of the end
         points of 32 fixed latents the one around which the others lie most densely; "zero", that of
         z = 0, which may lie between modes; or "drawn", that of a random latent. May be set later.
@@ -109,7 +109,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         embedding_dim: int = 64,
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
-        initialization: str = "glorot_zero_output",
+        initialization: str = "orthogonal",
         deterministic_action: str = "mode",
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
@@ -244,15 +244,15 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
 
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
         """Latents z ~ N(0, latent_scale^2) or the deterministic action's, shape (n, action_dim)."""
-        n = features.shape[0]  # len() would fix it when exporting
+        scale = self.latent_scale
+        is_zero = deterministic and self.deterministic_action == "zero"
+        if is_zero or (isinstance(scale, float) and scale == 0.0):
+            return features.new_zeros(features.shape[0], self.action_dim)
         if not deterministic or self.deterministic_action == "drawn":
-            size = (n, self.action_dim)
-            draws = th.randn(size, device=features.device, dtype=features.dtype)
-            return self.latent_scale * draws
-        if self.deterministic_action == "zero":
-            return features.new_zeros(n, self.action_dim)
-        latents = self.latent_scale * candidate_latents(self.action_dim).to(features)
-        return latents[densest_endpoints(self.transport, latents, features)]
+            size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
+            return scale * th.randn(size, device=features.device, dtype=features.dtype)
+        candidates = scale * candidate_latents(self.action_dim).to(features)
+        return candidates[densest_endpoints(self.transport, candidates, features)]
 
     @property
     @abstractmethod

@@ -23,12 +23,12 @@ class PolicyFlowOptions(FlowOptions, total=False):
     solver: str
     latent_std: float | None
     gaussian: bool
-    log_std_init: float | None
+    log_std_init: float
     log_std_bounds: tuple[float, float] | None
 
 
-LATENT_STD, NOISE_STD = 0.2, 0.4
-"""Initial standard deviations of latents and noise, in half the distance of the actions' bounds."""
+LATENT_STD = 0.2
+"""Standard deviation of the latents, in half the distance of the actions' bounds."""
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -59,10 +59,10 @@ class PolicyFlowPolicy(BaseFlowPolicy):
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
 
-    ``latent_std`` is not of the paper, whose latents have a standard deviation of 1. Latents add
-    noise to the actions that the importance ratio does not see; where actions are bounded by 1, it
-    is larger than sigma. Narrower latents learn locomotion faster (HalfCheetah several times as
-    fast), and learn tasks less well in which rewards have to be found first (docs/results.md).
+    The paper's latents have a standard deviation of 1. Latents spread the actions, and the
+    importance ratio does not see that; where actions are bounded by 1, they would drown the noise
+    that it sees. By default they are in proportion to the action space, which is 1 on the paper's
+    MultiGoal.
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
@@ -70,8 +70,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         which the update compares velocities. Its ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
-    :param latent_std: Standard deviation of the latents z, greater than 0. Other than 1 it needs an
-        interpolant without noise of its own, "rectified" or "trigflow".
+    :param latent_std: Standard deviation of the latents z, greater than 0. None for a fifth of half
+        the distance of the actions' bounds in each dimension, or 1 where there are no bounds, or
+        none within 200, or where the interpolant has noise of its own: "stochastic" ones need 1.
     :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
     :param log_std_init: Initial log standard deviation of the Gaussian noise.
     :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
@@ -85,7 +86,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         "n_flow_steps": checks.at_least(1),
         "solver": checks.one_of(SOLVERS),
         "latent_std": checks.or_none(checks.positive),
-        "log_std_init": checks.or_none(checks.finite),
+        "log_std_init": checks.finite,
         "log_std_bounds": checks.or_none(checks.bounds),
     }
     combination_checks = (check_latents,)
@@ -103,7 +104,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         solver: str = "midpoint",
         latent_std: float | None = None,
         gaussian: bool = False,
-        log_std_init: float | None = None,
+        log_std_init: float = 0.0,
         log_std_bounds: tuple[float, float] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -112,13 +113,12 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self.solver = solver
         self.latent_std = latent_std
         self.gaussian = gaussian
-        self.log_std_init: Any = log_std_init
+        self.log_std_init = log_std_init
         self.log_std_bounds = log_std_bounds
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
         # SB3 has set both to the defaults of its own actor.
         self.log_std_init = log_std_init
-        if log_std_init is not None:
-            nn.init.constant_(self.log_std, log_std_init)
+        nn.init.constant_(self.log_std, log_std_init)
         self.keep_within_bounds()
 
     def _build_actor(self) -> None:
@@ -126,10 +126,12 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         half_ranges = th.from_numpy(checks.half_ranges(self.action_space))
         latent_stds = (LATENT_STD * half_ranges).nan_to_num(posinf=1.0)
         self.register_buffer("default_latent_std", latent_stds, persistent=False)
-        self.log_std = nn.Parameter((NOISE_STD * half_ranges).nan_to_num(posinf=1.0).log())
+        self.log_std = nn.Parameter(th.zeros(self.action_dim))
 
     @property
     def latent_scale(self) -> float | th.Tensor:
+        if self.gaussian:
+            return 0.0
         if self.latent_std is not None:
             return self.latent_std
         is_stochastic = INTERPOLANTS[self.interpolant].stochastic
@@ -166,10 +168,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
         """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have no noise n."""
-        if self.gaussian:
-            latents = features.new_zeros(len(features), self.action_dim)
-        else:
-            latents = self.draw_latents(features, deterministic)
+        latents = self.draw_latents(features, deterministic)
         endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:
