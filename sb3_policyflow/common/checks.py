@@ -257,7 +257,7 @@ def warn_of_batches(batch_size: int, n_steps: int, n_envs: int) -> None:
         )
 
 
-def half_ranges(action_space: spaces.Space[Any]) -> NDArray[np.float32]:
+def half_ranges(action_space: spaces.Space[Any]) -> NDArray[np.float64]:
     """Half the distance of the bounds of actions; infinity where they are none that mean something.
 
     :param action_space: A Box.
@@ -268,4 +268,4 @@ def half_ranges(action_space: spaces.Space[Any]) -> NDArray[np.float32]:
         widths = action_space.high.astype(np.float64) - action_space.low.astype(np.float64)
     widths[widths >= SHORTEST_MEANINGLESS] = np.inf
     # A dimension that cannot move has a little noise, too: its logarithm must be finite.
-    return np.maximum(widths / 2, 1e-6).astype(np.float32).flatten()
+    return np.maximum(widths / 2, 1e-6).flatten()

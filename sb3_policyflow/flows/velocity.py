@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from numbers import Integral
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -244,8 +244,8 @@ TIME_STD = 0.3
 """Standard deviation of the time embedding where that of the observation embedding is 1."""
 
 
-def _fill_orthogonal(layer: nn.Linear, gain: float) -> None:
-    """Orthogonal weights that multiply the standard deviation of independent inputs by a gain."""
+def _fill_orthogonal(layer: Any, gain: float) -> None:
+    """A linear layer with orthogonal weights, which multiply the standard deviation by a gain."""
     n_out, n_in = layer.weight.shape
     nn.init.orthogonal_(layer.weight, gain * max(1.0, n_out / n_in) ** 0.5)
     nn.init.zeros_(layer.bias)
@@ -260,7 +260,8 @@ def _gain(activation: nn.Module) -> float:
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
     with th.no_grad():
         values = activation(th.as_tensor(nodes, dtype=th.float32, device="cpu")).double().numpy()
-    return float((weights * values**2).sum() / weights.sum()) ** -0.5
+    mean_square = float((weights * values**2).sum() / weights.sum())
+    return 1 / math.sqrt(mean_square)
 
 
 INITIALIZATIONS: dict[str, Callable[[VelocityField], None]] = {

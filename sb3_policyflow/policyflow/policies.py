@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
@@ -79,8 +80,6 @@ class PolicyFlowPolicy(BaseFlowPolicy):
     :raises ValueError: If an option is not supported.
     """
 
-    default_latent_std: th.Tensor
-
     option_checks: ClassVar[Mapping[str, checks.Check]] = {
         "interpolant": checks.one_of(INTERPOLANTS),
         "n_flow_steps": checks.at_least(1),
@@ -90,6 +89,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         "log_std_bounds": checks.or_none(checks.bounds),
     }
     combination_checks = (check_latents,)
+    latent_stds: th.Tensor
     fixed_options = frozenset({"log_std_init"})
 
     @accepts_former_names(path="interpolant")
@@ -123,9 +123,11 @@ class PolicyFlowPolicy(BaseFlowPolicy):
 
     def _build_actor(self) -> None:
         self.velocity = self._make_velocity_field()
-        half_ranges = th.from_numpy(checks.half_ranges(self.action_space))
-        latent_stds = (LATENT_STD * half_ranges).nan_to_num(posinf=1.0)
-        self.register_buffer("default_latent_std", latent_stds, persistent=False)
+        half_ranges = checks.half_ranges(self.action_space)
+        stds = np.where(np.isfinite(half_ranges), LATENT_STD * half_ranges, 1.0)
+        self._latent_std_of_all = float(stds[0]) if (stds == stds[0]).all() else None
+        like_weights: Any = {"dtype": th.float32, "device": "cpu"}
+        self.register_buffer("latent_stds", th.as_tensor(stds, **like_weights), persistent=False)
         self.log_std = nn.Parameter(th.zeros(self.action_dim))
 
     @property
@@ -134,8 +136,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
             return 0.0
         if self.latent_std is not None:
             return self.latent_std
-        is_stochastic = INTERPOLANTS[self.interpolant].stochastic
-        return 1.0 if is_stochastic else self.default_latent_std
+        if INTERPOLANTS[self.interpolant].stochastic:
+            return 1.0
+        return self.latent_stds if self._latent_std_of_all is None else self._latent_std_of_all
 
     @property
     def flow(self) -> Flow:
