@@ -51,7 +51,8 @@ def densest_endpoints(
     :return: Indices of latents, shape (n,).
     """
     n, k = features.shape[0], latents.shape[0]
-    repeated = features.unsqueeze(1).expand(-1, k, -1).flatten(0, 1)
+    # Contiguous, as kernels take it: of one observation it would be a view.
+    repeated = features.unsqueeze(1).expand(-1, k, -1).flatten(0, 1).contiguous()
     endpoints = transport(latents.repeat(n, 1), repeated)
     return densest(endpoints.reshape(n, k, -1))
 
