@@ -265,7 +265,7 @@ def half_ranges(action_space: spaces.Space[Any]) -> NDArray[np.float64]:
     """
     assert isinstance(action_space, spaces.Box)
     with np.errstate(over="ignore"):
-        widths = action_space.high.astype(np.float64) - action_space.low.astype(np.float64)
+        widths = (action_space.high.astype(np.float64) - action_space.low).flatten()
     widths[widths >= SHORTEST_MEANINGLESS] = np.inf
     # A dimension that cannot move has a little noise, too: its logarithm must be finite.
-    return np.maximum(widths / 2, 1e-6).flatten()
+    return np.maximum(widths / 2, 1e-6)

@@ -137,8 +137,8 @@ def keep_former_defaults(model: Any) -> None:
     taken = policy_parameters(model.policy_class)
     for name, value in FORMER_DEFAULTS.items():
         # A class of the user's own may have a default of its own.
-        base = policy_parameters(model.policy_base).get(name)
-        if name not in given and base is not None and taken[name].default == base.default:
+        own, base = taken.get(name), policy_parameters(model.policy_base).get(name)
+        if name not in given and own and base and own.default == base.default:
             model.policy_options[name] = value
 
 

@@ -54,7 +54,7 @@ def densest_endpoints(
     # Contiguous, as kernels take it: of one observation it would be a view.
     repeated = features.unsqueeze(1).expand(-1, k, -1).flatten(0, 1).contiguous()
     endpoints = transport(latents.repeat(n, 1), repeated)
-    return densest(endpoints.reshape(n, k, -1))
+    return densest(endpoints.reshape(n, k, endpoints.shape[-1]))
 
 
 @cache
