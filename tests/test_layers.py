@@ -15,7 +15,7 @@ BELOW: dict[str, set[str]] = {
     "resilience": set(),
     "kernels": {"flows"},
     "common": {"flows", "kernels", "resilience"},
-    **{name: {"common", "flows"} for name in ALGORITHMS},
+    **{name: {"common", "flows", "kernels"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
     "export": {"common", "algorithms"},

@@ -11,7 +11,6 @@ from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -19,8 +18,15 @@ from sb3_policyflow.common.schedules import (
     parse_schedule,
     start_adaptive_learning_rate,
 )
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
-from sb3_policyflow.kernels import reason_kernels_are_off
+from sb3_policyflow.common.update import (
+    FlowUpdate,
+    Loss,
+    UpdateMetrics,
+    check_step,
+    clip_gradients,
+    take_step,
+)
+from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
@@ -209,6 +215,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
+    @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         self._update_learning_rate(self.policy.optimizer)
@@ -216,7 +223,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
-        clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
@@ -225,19 +231,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
-                features, critic_features = self.policy.actor_critic_features(batch.observations)
-                terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
                 advantages = self._normalized(batch.advantages, "minibatch")
-                policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
-                # Squared error of the values against the TD(lambda) returns
-                values = self.policy.values(critic_features).flatten()
-                value_loss = clipped_value_loss(
-                    values, batch.old_values, batch.returns, clip_range_vf
-                )
-                metrics.add_means({"value_loss": value_loss, **terms.metrics})
-                loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
-                kls.append(terms.kl.detach())
-                stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
+                # Lines 18 to 21: ratio, surrogate objective, regularizers, error of the values
+                loss, kl = update.loss(batch._replace(advantages=advantages), metrics)
+                kls.append(kl)
+                stop = self.target_kl is not None and kl.item() > 1.5 * self.target_kl
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
@@ -259,9 +257,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return advantages
 
-    def _optimize(
-        self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
-    ) -> None:
+    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
@@ -269,13 +265,13 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         for parameter in parameters:
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
-        th.autograd.backward(loss, inputs=trained)
+        loss.backward(inputs=trained)
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
-        self.policy.optimizer.step()
+        take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
 
-    def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+    def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):

@@ -2,14 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
-from sb3_policyflow.common.losses import SURROGATES
-from sb3_policyflow.kernels import clip_gradients_in_place
+from sb3_policyflow.common.losses import SURROGATES, clipped_value_loss
+from sb3_policyflow.kernels import clip_gradients_in_place, step_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -26,6 +26,32 @@ class PolicyTerms(NamedTuple):
     metrics: dict[str, th.Tensor]
 
 
+class Loss(Protocol):
+    """What a step of the optimizer needs of a loss: a tensor is one."""
+
+    def item(self) -> float:
+        """Its value."""
+
+    def backward(self, *, inputs: Any = None) -> None:
+        """Add its gradients to those of the parameters; of ``inputs`` only, if they are given."""
+
+
+class CompiledTerms(NamedTuple):
+    """A minibatch's loss and divergence, see :class:`PolicyTerms`, and what is to be logged.
+
+    Means over the minibatches are logged of ``means``, and the greatest of ``maxima``.
+    """
+
+    loss: Loss
+    kl: th.Tensor
+    means: dict[str, float]
+    maxima: dict[str, float]
+
+
+CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], CompiledTerms | None]
+"""Takes a minibatch, and the features of actor and critic; None where kernels cannot work."""
+
+
 class FlowUpdate(ABC):
     """An algorithm's part of the update of one rollout.
 
@@ -35,7 +61,8 @@ class FlowUpdate(ABC):
     ``clip_range`` is epsilon, one number or of a shape that broadcasts with a log ratio (n, ...).
     Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
     ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
-    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout.
+    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout. If there is a
+    ``compiled_loss``, it takes the place of the formulas in :meth:`loss` where it can.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
@@ -43,6 +70,11 @@ class FlowUpdate(ABC):
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
+        self.policy: Any = algorithm.policy
+        self.vf_coef: float = algorithm.vf_coef
+        bounds_values = algorithm.clip_range_vf is not None
+        self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
+        self.compiled_loss: CompiledLoss | None = None
         self.batch_size: int = algorithm.batch_size
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
@@ -61,6 +93,30 @@ class FlowUpdate(ABC):
         :param batch: A minibatch of n samples, with what was drawn for them.
         :param features: The actor's features, shape (n, features_dim).
         """
+
+    def loss(
+        self, batch: FlowRolloutBufferSamples, metrics: "UpdateMetrics"
+    ) -> tuple[Loss, th.Tensor]:
+        """The loss of a minibatch (paper, algorithm 1, lines 18 to 21).
+
+        :param batch: n samples, with what was drawn for them.
+        :param metrics: Takes what is to be logged.
+        :return: The loss, and the divergence from the reference policy, without dimensions.
+        """
+        features, critic_features = self.policy.actor_critic_features(batch.observations)
+        if self.compiled_loss is not None:
+            compiled = self.compiled_loss(batch, features, critic_features)
+            if compiled is not None:
+                metrics.add_means(compiled.means)
+                metrics.add_maxima(compiled.maxima)
+                return compiled.loss, compiled.kl
+        terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
+        policy_loss = self.surrogate_loss(terms.log_ratio, batch.advantages, metrics)  # line 19
+        # Squared error of the values against the TD(lambda) returns
+        values = self.policy.values(critic_features).flatten()
+        value_loss = clipped_value_loss(values, batch.old_values, batch.returns, self.clip_range_vf)
+        metrics.add_means({"value_loss": value_loss, **terms.metrics})
+        return policy_loss + terms.regularizer + self.vf_coef * value_loss, terms.kl.detach()
 
     def surrogate_loss(
         self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
@@ -104,33 +160,40 @@ class UpdateMetrics:
     """
 
     def __init__(self) -> None:
-        self._to_average: dict[str, list[th.Tensor]] = {}
-        self._to_maximize: dict[str, list[th.Tensor]] = {}
+        self._to_average: dict[str, list[Any]] = {}
+        self._to_maximize: dict[str, list[Any]] = {}
 
-    def add_means(self, metrics: Mapping[str, th.Tensor]) -> None:
-        """Add metrics of one minibatch, tensors without dimensions, that are averaged."""
+    def add_means(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
+        """Add metrics of one minibatch, tensors without dimensions or numbers, to be averaged."""
         for name, value in metrics.items():
             self._append(self._to_average.setdefault(name, []), value)
 
-    def add_maxima(self, metrics: Mapping[str, th.Tensor]) -> None:
+    def add_maxima(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
         """Add metrics of one minibatch of which the greatest counts."""
         for name, value in metrics.items():
             self._append(self._to_maximize.setdefault(name, []), value)
 
     @staticmethod
-    def _append(values: list[th.Tensor], value: th.Tensor) -> None:
-        values.append(value.detach())
-        if len(values) == 32:
+    def _append(values: list[Any], value: th.Tensor | float) -> None:
+        values.append(value.detach() if isinstance(value, th.Tensor) else value)
+        if len(values) == 32 and isinstance(value, th.Tensor):
             # Many small tensors would keep the memory between them from being used again.
-            values[:] = [th.hstack(values)]
+            values[:] = [_joined(values)]
 
     def summary(self) -> dict[str, float]:
         """Each metric over all minibatches."""
-        reduced = {name: th.hstack(values).mean() for name, values in self._to_average.items()}
-        reduced |= {name: th.hstack(values).max() for name, values in self._to_maximize.items()}
+        reduced = {name: _joined(values).mean() for name, values in self._to_average.items()}
+        reduced |= {name: _joined(values).max() for name, values in self._to_maximize.items()}
         if not reduced:
             return {}
         return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))
+
+
+def _joined(values: list[Any]) -> th.Tensor:
+    """Tensors and numbers as one tensor."""
+    numbers = [value for value in values if not isinstance(value, th.Tensor)]
+    tensors = [value for value in values if isinstance(value, th.Tensor)]
+    return th.hstack([*tensors, th.tensor(numbers)] if numbers else tensors)
 
 
 def make_optimizer(
@@ -179,6 +242,12 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)
     return norm
+
+
+def take_step(optimizer: th.optim.Optimizer) -> None:
+    """Take a step of an optimizer, in one call of a kernel if it is plain Adam on a CPU."""
+    if not step_in_place(optimizer):
+        optimizer.step()
 
 
 def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> None:
