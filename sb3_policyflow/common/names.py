@@ -2,11 +2,12 @@
 
 import inspect
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from difflib import get_close_matches
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from stable_baselines3.common.policies import BasePolicy
+
+from sb3_policyflow.hints import did_you_mean, either, nearest
 
 FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
 """Present values of options by option and former value."""
@@ -106,20 +107,10 @@ def unknown_argument(
         )
     if name in FOREIGN_ARGUMENTS:
         return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
-    similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
+    similar = nearest(name, {*own, *of_policy})
     places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
-    meant = f"did you mean {_either(places)}?" if places else f"help({owner}) shows those it has."
+    meant = f"did you mean {either(places)}?" if places else f"help({owner}) shows those it has."
     return TypeError(f"{owner} has no argument {name!r}: {meant}")
-
-
-def _either(names: Iterable[str]) -> str:
-    """The names in a sentence.
-
-    >>> _either(["a", "b", "c"])
-    'a, b or c'
-    """
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
 
 
 def with_present_names(
