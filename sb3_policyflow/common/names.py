@@ -14,6 +14,8 @@ FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
+    "use_sde": OF_GSDE,
+    "sde_sample_freq": OF_GSDE,
     "full_std": OF_GSDE,
     "use_expln": OF_GSDE,
     "squash_output": (
@@ -111,6 +113,68 @@ def unknown_argument(
     places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
     meant = f"did you mean {either(places)}?" if places else f"help({owner}) shows those it has."
     return TypeError(f"{owner} has no argument {name!r}: {meant}")
+
+
+def check_names(
+    signature: inspect.Signature,
+    policy_class: type[Any],
+    args: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> None:
+    """Refuse arguments that an algorithm does not have, and one that would have no effect.
+
+    :param signature: The signature of the algorithm's constructor.
+    :param policy_class: The base of its policies.
+    :param args: What was given by position, the algorithm first.
+    :param options: What was given by name.
+    :raises TypeError: With where an argument belongs, or which one may be meant.
+    :raises ValueError: If there is no policy of a name, or options of gSDE are given.
+    """
+    model, policy, *_ = (*args, options.get("policy"))
+    if isinstance(policy, str) and policy not in model.policy_aliases:
+        raise ValueError(
+            f"{type(model).__name__} has no policy {policy!r}: "
+            f"{did_you_mean(policy, model.policy_aliases)}"
+        )
+    if not isinstance(options.get("policy_kwargs") or {}, dict):
+        raise ValueError(
+            f"policy_kwargs must be a dictionary, such as dict(net_arch=[64, 64]), got "
+            f"{options['policy_kwargs']!r}."
+        )
+    if isinstance(policy, type) and issubclass(policy, policy_class):
+        policy_class = policy
+    own = signature.parameters.keys() - {"self"}
+    for name in options.keys() - own:
+        of_policy = policy_parameters(policy_class).keys() - own
+        raise unknown_argument(type(model).__name__, name, own, of_policy)
+    if options.get("sde_sample_freq", -1) != -1:
+        raise ValueError(
+            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
+            "not support: leave it out."
+        )
+
+
+def check_saved_by(model: Any) -> None:
+    """Refuse a file that another algorithm has saved.
+
+    :param model: An algorithm whose attributes are those of the file.
+    :raises ValueError: With the algorithm to load it with.
+    """
+    name, policy_class = type(model).__name__, model.policy_class
+    if issubclass(policy_class, model.policy_base):
+        return
+    shared: Any = type(model).__base__
+    siblings = [
+        cls.__name__ for cls in shared.__subclasses__() if issubclass(policy_class, cls.policy_base)
+    ]
+    of_sb3 = {"SACPolicy": "SAC", "TD3Policy": "TD3", "DQNPolicy": "DQN"}
+    # A file of PPO has made a schedule of the number that is there at first.
+    of_sb3["ActorCriticPolicy"] = "PPO" if callable(model.clip_range) else "A2C"
+    names = [cls.__name__ for cls in policy_class.__mro__]
+    saver, *_ = siblings + [of_sb3[base] for base in names if base in of_sb3] + [""]
+    if not saver:
+        raise ValueError(f"This file holds a {names[0]}, which {name} did not save.")
+    raise ValueError(f"This file was saved by {saver}, not by {name}: use {saver}.load.")
 
 
 def with_present_names(

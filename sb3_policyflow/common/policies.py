@@ -105,6 +105,7 @@ class FlowPolicy(ActorCriticPolicy):
         random_latents: bool = False,
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
+        checks.check_networks(net_arch, activation_fn, optimizer_class, features_extractor_class)
         check_overridden_methods(type(self), FlowPolicy)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
@@ -309,8 +310,8 @@ class FlowPolicy(ActorCriticPolicy):
 
     def _no_likelihood(self) -> TypeError:
         return TypeError(
-            f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
-            "flow algorithms of sb3_policyflow, which need none."
+            f"{type(self).__name__} has no closed-form likelihood of actions, which PPO needs: "
+            "make, load and train it with the flow algorithms of sb3_policyflow, which need none."
         )
 
 

@@ -1,9 +1,10 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
 import functools
+import inspect
 import io
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, ParamSpec, TypeVar
 
@@ -15,6 +16,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_policyflow.hints import did_you_mean
 from sb3_policyflow.resilience.collection import (
     Infos,
     PendingBonus,
@@ -23,7 +25,7 @@ from sb3_policyflow.resilience.collection import (
     terminal_observations,
     time_limits,
 )
-from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
+from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
 from sb3_policyflow.resilience.saving import RandomStates, ResumeState
 from sb3_policyflow.resilience.workers import watch_workers
@@ -31,6 +33,22 @@ from sb3_policyflow.resilience.workers import watch_workers
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+def check_attributes(algorithm: type[Any], given: Collection[str], saved: Collection[str]) -> None:
+    """Refuse attributes for ``load`` to change that no model has.
+
+    :param algorithm: The class of the model.
+    :param given: Their names.
+    :param saved: Names of the attributes that are in the file.
+    :raises TypeError: With the nearest names.
+    """
+    arguments = inspect.signature(algorithm).parameters.keys() - {"policy", "env"}
+    known = {*arguments, *algorithm.former_names, *saved}
+    for name in given:
+        if name not in known and not hasattr(algorithm, name):
+            meant = did_you_mean(name, known, "the file has no such attribute.")
+            raise TypeError(f"{algorithm.__name__}.load has no {name!r} to change: {meant}")
 
 
 def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
@@ -237,9 +255,11 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             sets them, as SB3 does. So does a ``seed`` among ``kwargs``.
         :param kwargs: Attributes to change.
         :raises ValueError: If the file is no saved model, or the environment does not fit it.
+        :raises TypeError: If there is no attribute of a name among ``kwargs``.
         """
         with opened(path, suffix="zip") as file:
             check_archive(file, path, members=("data", "policy.pth"))
+            check_attributes(cls, kwargs, saved_attributes(file))
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )

@@ -31,9 +31,7 @@ def require_task(task: str) -> None:
 
     names = all_tasks()
     if task not in names:
-        raise NameNotFound(
-            f"MuJoCo Playground has no task {task!r}: {did_you_mean(task, names)}"
-        )
+        raise NameNotFound(f"MuJoCo Playground has no task {task!r}: {did_you_mean(task, names)}")
 
 
 def _require_playground(env_id: str) -> None:
