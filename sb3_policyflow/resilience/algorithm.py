@@ -27,7 +27,7 @@ from sb3_policyflow.resilience.collection import (
 )
 from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
-from sb3_policyflow.resilience.saving import RandomStates, ResumeState
+from sb3_policyflow.resilience.saving import Observed, RandomStates, ResumeState
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
@@ -87,7 +87,12 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
-    unsaved: ClassVar[tuple[str, ...]] = ("_callback", "_step_checks", "_saved_random_states")
+    unsaved: ClassVar[tuple[str, ...]] = (
+        "_callback",
+        "_step_checks",
+        "_saved_random_states",
+        "_saved_observed",
+    )
     """Attributes that no file has."""
 
     _callback: BaseCallback | None = None
@@ -95,6 +100,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
+
+    _saved_observed: Observed | None = None
+    """What a file says of the observations in the training that it is from."""
 
     # Collecting rollouts
 
@@ -210,6 +218,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         self.resume_state = ResumeState(
             random_states=self._saved_random_states or RandomStates.now(self.device),
             normalized_returns=None if normalize is None else normalize.returns.copy(),
+            observed=self.observed(),
         )
         try:
             if isinstance(path, (str, pathlib.Path)):
@@ -267,9 +276,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         state: ResumeState | None = model.__dict__.pop("resume_state", None)
         if not force_reset:
             model._continue_episodes(state)
+        model._saved_observed = None if state is None else state.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
+
+    def observed(self) -> Observed:
+        """What the policy observed in training: whether it was normalized, and the space before."""
+        normalize = self.get_vec_normalize_env()
+        if normalize is not None:
+            return Observed(normalize.norm_obs, normalize.venv.observation_space)
+        return self._saved_observed or Observed(False, self.observation_space)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Those that ``load`` has found are forgotten.

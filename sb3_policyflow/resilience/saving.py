@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 
 
 class RandomStates(NamedTuple):
@@ -42,11 +43,29 @@ def preserve_rng_state(device: th.device) -> Iterator[None]:
         states.restore(device)
 
 
-class ResumeState(NamedTuple):
-    """Random states, and the running discounted returns of ``VecNormalize``, shape (n_envs,).
+class Observed(NamedTuple):
+    """What a policy observed in training.
 
-    ``VecNormalize`` leaves them out of its own ``save``; None if the model has no such wrapper.
+    ``is_normalized`` says whether ``VecNormalize`` normalized observations, None if the file does
+    not say (version 0.1.0); ``space`` is that of the environment's own observations, if known.
+    """
+
+    is_normalized: bool | None
+    space: spaces.Space[Any] | None
+
+
+class ResumeState(NamedTuple):
+    """Random states, and what ``VecNormalize`` leaves out of its own ``save``.
+
+    ``normalized_returns`` are its running discounted returns, shape (n_envs,); None without it.
     """
 
     random_states: RandomStates
     normalized_returns: np.ndarray | None
+    observed: Observed | None = None
+
+    def what_was_observed(self) -> Observed | None:
+        """What the policy observed; None if it was what the policy's own space says."""
+        if self.observed is None and self.normalized_returns is not None:
+            return Observed(None, None)
+        return self.observed
