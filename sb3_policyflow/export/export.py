@@ -119,8 +119,8 @@ def _write_onnx(program: th.export.ExportedProgram, example: tuple[Any, ...], pa
         verbose=False,
     )
     assert onnx_program is not None
-    axes = {part.shape[0] for part in onnx_program.model.graph.inputs if part.shape}
-    onnx_program.rename_axes(dict.fromkeys(axes, "batch"))
+    axes = [part.shape[0] for part in onnx_program.model.graph.inputs if part.shape]
+    onnx_program.rename_axes({str(axis): "batch" for axis in axes})
     onnx_program.save(path, external_data=False)
 
 
