@@ -20,8 +20,16 @@ BELOW: dict[str, set[str]] = {
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
     "export": {"common", "algorithms", "hints", "resilience"},
-    "integrations": {"algorithms", "common", "envs", "hints", "policyflow", "resilience"},
-    "benchmark": {"common", "envs", "hints", "integrations", "resilience", "__init__"},
+    "integrations": {"algorithms", "callbacks", "envs", "hints", "policyflow", "resilience"},
+    "benchmark": {
+        "callbacks",
+        "common",
+        "envs",
+        "hints",
+        "integrations",
+        "resilience",
+        "__init__",
+    },
 }
 """What each folder or module of the package may import."""
 
