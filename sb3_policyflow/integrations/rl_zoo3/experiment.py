@@ -81,26 +81,24 @@ def read_own_keys(manager: Any) -> None:
         if not isinstance(given, bool):
             raise SystemExit(f"deterministic_eval must be True or False, got {given!r}.")
         manager.deterministic_eval = given
-        check_hyperparams(manager.algo, rest)
+        if manager.algo in ALGORITHMS:
+            check_hyperparams(ALGORITHMS[manager.algo], rest)
         return preprocess(rest)
 
     manager._preprocess_hyperparams = read
 
 
-def check_hyperparams(algo: str, hyperparams: Collection[str]) -> None:
-    """Refuse hyperparameters that an algorithm of this package does not have.
+def check_hyperparams(algorithm: type[Any], hyperparams: Collection[str]) -> None:
+    """Refuse hyperparameters that an algorithm does not have.
 
-    :param algo: Name of the algorithm; others are let pass.
+    :param algorithm: Its class.
     :param hyperparams: Names, as in a YAML file or behind ``-params``.
     :raises SystemExit: With the nearest names: a command ends without a traceback.
     """
-    if algo not in ALGORITHMS:
-        return
-    algorithm = ALGORITHMS[algo]
     arguments = inspect.signature(algorithm).parameters.keys() - {"env", "_init_setup_model"}
     known = {*arguments, *ZOO_KEYS}
     for name in hyperparams:
-        if name not in known and name not in algorithm.former_names:
+        if name not in known and name not in getattr(algorithm, "former_names", {}):
             meant = did_you_mean(name, known)
             raise SystemExit(f"{algorithm.__name__} has no hyperparameter {name!r}: {meant}")
 
