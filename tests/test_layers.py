@@ -25,6 +25,7 @@ BELOW: dict[str, set[str]] = {
         "callbacks",
         "common",
         "envs",
+        "export",
         "hints",
         "integrations",
         "resilience",
