@@ -14,6 +14,7 @@ COMMANDS = {
     "multigoal": ("multigoal", "the paper's MultiGoal figure"),
     "pointmaze": ("pointmaze", "the paper's exploration maps"),
     "playground": ("playground", "four algorithms on tasks of MuJoCo Playground"),
+    "card": ("card", "evaluate a model and write its Hugging Face model card"),
     "speed": ("speed.training", "time PolicyFlow and PPO side by side"),
     "environments": ("speed.environments", "time environments on their own"),
 }

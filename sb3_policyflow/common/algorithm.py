@@ -1,12 +1,12 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
+from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
@@ -34,8 +34,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
-    supported, ``max_grad_norm`` may be None or not positive for no clipping, and ``ent_coef`` may
-    be a schedule; and:
+    supported, ``max_grad_norm`` may be None or not positive for no clipping, and coefficients and
+    rates may be schedules, also as "lin_START" or "lin_START_END"; and:
 
     :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
         a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
@@ -80,14 +80,14 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self,
         policy: str | type[FlowPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: Coefficient = 3e-4,
         n_steps: int = 2048,
         batch_size: int = 64,
         n_epochs: int = 10,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
+        clip_range: Coefficient = 0.2,
+        clip_range_vf: Coefficient | None = None,
         normalize_advantage: bool = True,
         ent_coef: Coefficient = 0.0,
         vf_coef: float = 0.5,
@@ -131,7 +131,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         super().__init__(
             policy,
             env,
-            learning_rate=learning_rate,
+            learning_rate=cast(float, learning_rate),  # may be a string here
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -162,9 +162,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         super()._setup_model()
         self.policy_kwargs = own
         self.known_policy_options = options.values_on_policy(self)
-        self.clip_range = FloatSchedule(self.clip_range)
+        self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:
-            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+            self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
         for check in self.model_checks:
             check(self)
@@ -181,7 +181,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         return float(schedule(self._current_progress_remaining))
 
     def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
+        self.lr_schedule = parse_schedule("learning_rate", self.learning_rate)
         self._learning_rates = self.learning_rate, self.lr_schedule
 
     def read_learning_rate(self) -> None:

@@ -2,14 +2,15 @@
 
 import inspect
 import warnings
-from collections.abc import Collection, Iterable, Mapping
-from difflib import get_close_matches
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_policyflow.hints import did_you_mean, either, nearest
 
 FORMER_VALUES: dict[tuple[str, object], str] = {
     ("time_sampler", "starts"): "grid_without_end",
@@ -23,6 +24,8 @@ FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
+    "use_sde": OF_GSDE,
+    "sde_sample_freq": OF_GSDE,
     "full_std": OF_GSDE,
     "use_expln": OF_GSDE,
     "squash_output": (
@@ -86,8 +89,8 @@ class WithoutLikelihood:
 
     def _no_likelihood(self) -> TypeError:
         return TypeError(
-            f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
-            "flow algorithms of sb3_policyflow, which need none."
+            f"{type(self).__name__} has no closed-form likelihood of actions, which PPO needs: "
+            "make, load and train it with the flow algorithms of sb3_policyflow, which need none."
         )
 
 
@@ -176,20 +179,72 @@ def unknown_argument(
         )
     if name in FOREIGN_ARGUMENTS:
         return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
-    similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
+    similar = nearest(name, {*own, *of_policy})
     places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
-    meant = f"did you mean {_either(places)}?" if places else f"help({owner}) shows those it has."
+    meant = f"did you mean {either(places)}?" if places else f"help({owner}) shows those it has."
     return TypeError(f"{owner} has no argument {name!r}: {meant}")
 
 
-def _either(names: Iterable[str]) -> str:
-    """The names in a sentence.
+def check_names(
+    signature: inspect.Signature,
+    policy_class: type[Any],
+    args: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> None:
+    """Refuse arguments that an algorithm does not have, and one that would have no effect.
 
-    >>> _either(["a", "b", "c"])
-    'a, b or c'
+    :param signature: The signature of the algorithm's constructor.
+    :param policy_class: The base of its policies.
+    :param args: What was given by position, the algorithm first.
+    :param options: What was given by name.
+    :raises TypeError: With where an argument belongs, or which one may be meant.
+    :raises ValueError: If there is no policy of a name, or options of gSDE are given.
     """
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
+    model, policy, *_ = (*args, options.get("policy"))
+    if isinstance(policy, str) and policy not in model.policy_aliases:
+        raise ValueError(
+            f"{type(model).__name__} has no policy {policy!r}: "
+            f"{did_you_mean(policy, model.policy_aliases)}"
+        )
+    if not isinstance(options.get("policy_kwargs") or {}, dict):
+        raise ValueError(
+            f"policy_kwargs must be a dictionary, such as dict(net_arch=[64, 64]), got "
+            f"{options['policy_kwargs']!r}."
+        )
+    if isinstance(policy, type) and issubclass(policy, policy_class):
+        policy_class = policy
+    own = signature.parameters.keys() - {"self"}
+    for name in options.keys() - own:
+        of_policy = policy_parameters(policy_class).keys() - own
+        raise unknown_argument(type(model).__name__, name, own, of_policy)
+    if options.get("sde_sample_freq", -1) != -1:
+        raise ValueError(
+            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
+            "not support: leave it out."
+        )
+
+
+def check_saved_by(model: Any) -> None:
+    """Refuse a file that another algorithm has saved.
+
+    :param model: An algorithm whose attributes are those of the file.
+    :raises ValueError: With the algorithm to load it with.
+    """
+    name, policy_class = type(model).__name__, model.policy_class
+    if issubclass(policy_class, model.policy_base):
+        return
+    shared: Any = type(model).__base__
+    siblings = [
+        cls.__name__ for cls in shared.__subclasses__() if issubclass(policy_class, cls.policy_base)
+    ]
+    of_sb3 = {"SACPolicy": "SAC", "TD3Policy": "TD3", "DQNPolicy": "DQN"}
+    # A file of PPO has made a schedule of the number that is there at first.
+    of_sb3["ActorCriticPolicy"] = "PPO" if callable(model.clip_range) else "A2C"
+    names = [cls.__name__ for cls in policy_class.__mro__]
+    saver, *_ = siblings + [of_sb3[base] for base in names if base in of_sb3] + [""]
+    if not saver:
+        raise ValueError(f"This file holds a {names[0]}, which {name} did not save.")
+    raise ValueError(f"This file was saved by {saver}, not by {name}: use {saver}.load.")
 
 
 def with_present_names(

@@ -113,6 +113,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         deterministic_action: str = "mode",
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
+        checks.check_networks(net_arch, activation_fn, optimizer_class, features_extractor_class)
         check_overridden_methods(type(self), FlowPolicy)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.flows.bounds import SHORTEST_MEANINGLESS
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
 
 
@@ -73,7 +74,7 @@ def warn_of_wide_bounds(policy: "DPPOPolicy") -> None:
     if policy.process != "ddpm":
         return
     width = (box.high - box.low).max()
-    if width >= checks.SHORTEST_MEANINGLESS:
+    if width >= SHORTEST_MEANINGLESS:
         warnings.warn(
             f"process='ddpm' scales actions to their bounds, which are up to {width:g} apart: the "
             f"standard deviation of untrained actions is about {0.19 * width:.2g}. If these bounds "

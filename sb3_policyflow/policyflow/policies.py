@@ -14,6 +14,7 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions, accepts_former_names
 from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
 from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
+from sb3_policyflow.flows.bounds import half_ranges
 
 
 class PolicyFlowOptions(FlowOptions, total=False):
@@ -123,8 +124,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
 
     def _build_actor(self) -> None:
         self.velocity = self._make_velocity_field()
-        half_ranges = checks.half_ranges(self.action_space)
-        stds = np.where(np.isfinite(half_ranges), LATENT_STD * half_ranges, 1.0)
+        assert isinstance(self.action_space, spaces.Box)
+        ranges = half_ranges(self.action_space.low, self.action_space.high)
+        stds = np.where(np.isfinite(ranges), LATENT_STD * ranges, 1.0)
         self._latent_std_of_all = float(stds[0]) if (stds == stds[0]).all() else None
         like_weights: Any = {"dtype": th.float32, "device": "cpu"}
         self.register_buffer("latent_stds", th.as_tensor(stds, **like_weights), persistent=False)

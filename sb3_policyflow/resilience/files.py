@@ -104,7 +104,10 @@ def check_archive(file: IO[bytes], path: Any, members: tuple[str, ...]) -> None:
 
 
 def saved_attributes(file: IO[bytes]) -> set[str]:
-    """Names of the attributes in the file of a saved model, which is left at its start."""
+    """Names of the attributes in a saved model; the file is left at its start.
+
+    :param file: The opened file, a whole archive.
+    """
     start = file.tell()
     with zipfile.ZipFile(file) as archive:
         names = set(json.loads(archive.read("data")))

@@ -165,10 +165,12 @@ DELIBERATE_DIFFERENCES = {
     "policy": {"annotation"},
     # None, or a number that is not positive, turns clipping off.
     "max_grad_norm": {"annotation"},
-    # May be a schedule.
+    # May be schedules, also in words.
     "ent_coef": {"annotation"},
+    "learning_rate": {"annotation"},
+    "clip_range_vf": {"annotation"},
     # FPO's ratios are those of an average over probes, and move less.
-    "clip_range": {"default"},
+    "clip_range": {"annotation", "default"},
     # As their papers integrate: PolicyFlow with 12 midpoint steps, FPO with 10 Euler steps.
     "n_flow_steps": {"default"},
     "solver": {"default"},
