@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 
 N_CANDIDATES = 32
 """How many latents the deterministic action is chosen from."""
@@ -57,14 +58,19 @@ def densest_endpoints(
     return densest(endpoints.reshape(n, k, endpoints.shape[-1]))
 
 
-@cache
 def candidate_latents(dim: int) -> th.Tensor:
     """Fixed latents to choose the deterministic action from: 0, and draws from N(0, I).
 
     :param dim: Dimensions of the action.
     :return: Shape (N_CANDIDATES, dim), float32 on the CPU; the same in every process.
     """
+    # What is cached is no tensor: one that is made while a policy is exported has no values.
+    return th.from_numpy(_candidates(dim))
+
+
+@cache
+def _candidates(dim: int) -> NDArray[np.float32]:
     # This generator's numbers will not change in later versions of NumPy.
     draws = np.random.RandomState(0).standard_normal((N_CANDIDATES, dim))
     draws[0] = 0.0
-    return th.from_numpy(draws.astype(np.float32))
+    return draws.astype(np.float32)
