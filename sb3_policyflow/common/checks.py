@@ -162,6 +162,23 @@ def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any])
         )
 
 
+def check_model(model: Any) -> None:
+    """Refuse options that do not go together with each other or with the policy that was made.
+
+    :param model: An algorithm that has its policy.
+    :raises TypeError: If a critic is to be trained alone that cannot be told from the actor.
+    """
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
+        )
+    for check in model.model_checks:
+        check(model)
+
+
 def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
     """Refuse what a flow policy cannot do.
 

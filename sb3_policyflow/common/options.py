@@ -65,6 +65,7 @@ class FlowOptions(TypedDict, total=False):
     advantage_scope: str
     timeout_bootstrap: str
     allow_nan_observations: bool
+    n_critic_warmup: int
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
@@ -83,6 +84,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "n_epochs": checks.at_least(1),
     "advantage_scope": checks.one_of(("minibatch", "rollout")),
     "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
+    "n_critic_warmup": checks.at_least(0),
 }
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
 
@@ -310,8 +312,7 @@ def take_up_changes(model: Any) -> None:
     """
     check_values(model)
     note_changed_options(model)
-    for check in model.model_checks:
-        check(model)
+    checks.check_model(model)
     model.rollout_buffer.gamma = model.gamma
     model.rollout_buffer.gae_lambda = model.gae_lambda
     model.read_learning_rate()

@@ -48,7 +48,7 @@ class FlowUpdate(ABC):
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
-        self.trains_actor = True
+        self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
 
     @abstractmethod
     def draw(self) -> tuple[th.Tensor, ...]:
