@@ -43,6 +43,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
     :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
+        from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -103,6 +105,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
         n_critic_warmup: int = 0,
+        imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -117,6 +120,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
         self.n_critic_warmup = n_critic_warmup
+        self.imitation_coef = imitation_coef
+        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
@@ -223,7 +228,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
                 features, critic_features = self.policy.actor_critic_features(batch.observations)
-                terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
+                terms = update.all_terms(
+                    batch, features
+                )  # lines 18, 20 and 21: ratio, regularizers
                 advantages = self._normalized(batch.advantages, "minibatch")
                 policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
                 # Squared error of the values against the TD(lambda) returns

@@ -179,6 +179,19 @@ def check_model(model: Any) -> None:
         check(model)
 
 
+def check_cloned(model: Any) -> None:
+    """Refuse a pull towards a policy that does not exist.
+
+    :raises ValueError: If the model was not cloned from demonstrations.
+    """
+    if model.imitation_coef != 0 and model.cloned_parameters is None:
+        raise ValueError(
+            f"imitation_coef={model.imitation_coef!r} pulls towards a policy that was cloned from "
+            "demonstrations, and this model was not: call sb3_policyflow.imitation.clone first, or "
+            "leave it out."
+        )
+
+
 def check_flow_spaces(action_space: spaces.Space[Any], use_sde: bool) -> None:
     """Refuse what a flow policy cannot do.
 

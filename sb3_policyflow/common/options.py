@@ -66,6 +66,7 @@ class FlowOptions(TypedDict, total=False):
     timeout_bootstrap: str
     allow_nan_observations: bool
     n_critic_warmup: int
+    imitation_coef: Coefficient
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
@@ -85,6 +86,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "advantage_scope": checks.one_of(("minibatch", "rollout")),
     "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
     "n_critic_warmup": checks.at_least(0),
+    "imitation_coef": parse_schedule,
 }
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
 
@@ -297,9 +299,8 @@ def check_values(model: Any) -> None:
     :raises ValueError: With what to use instead.
     """
     checks.check_options(model)
-    checks.check_batch_size(
-        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
-    )
+    sizes = model.batch_size, model.n_steps, model.n_envs
+    checks.check_batch_size(*sizes, model.normalize_advantage)
     if model.desired_kl is not None:
         check_desired_kl(model.desired_kl, model.learning_rate)
 
@@ -311,6 +312,7 @@ def take_up_changes(model: Any) -> None:
     :raises ValueError: If a value cannot be used, or cannot change.
     """
     check_values(model)
+    checks.check_cloned(model)
     note_changed_options(model)
     checks.check_model(model)
     model.rollout_buffer.gamma = model.gamma

@@ -3,12 +3,14 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES
+from sb3_policyflow.flows import MatchingSamples
 from sb3_policyflow.kernels import clip_gradients_in_place
 
 
@@ -49,6 +51,9 @@ class FlowUpdate(ABC):
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
+        self.pull: ImitationPull | None = None
+        if (coef := algorithm.value_of("imitation_coef")) > 0:
+            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)
 
     @abstractmethod
     def draw(self) -> tuple[th.Tensor, ...]:
@@ -61,6 +66,14 @@ class FlowUpdate(ABC):
         :param batch: A minibatch of n samples, with what was drawn for them.
         :param features: The actor's features, shape (n, features_dim).
         """
+
+    def all_terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
+        """The terms of the policy loss, with the pull towards a cloned policy if there is one.
+
+        Takes the arguments of :meth:`terms`.
+        """
+        terms = self.terms(batch, features)
+        return terms if self.pull is None else self.pull.added_to(terms, batch, features)
 
     def surrogate_loss(
         self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
@@ -90,6 +103,60 @@ class FlowUpdate(ABC):
             }
         )
         return loss
+
+
+def matched_outputs(policy: Any, drawn: MatchingSamples, features: th.Tensor) -> th.Tensor:
+    """What a policy's network says at the points of flow matching, shape (n, action_dim).
+
+    :param policy: The policy.
+    :param drawn: The points.
+    :param features: The actor's features, shape (n, features_dim).
+    """
+    # Behind its own, DPPO has features for networks that are not trained.
+    features = features[:, : policy.mlp_extractor.latent_dim_pi]
+    outputs: th.Tensor = policy.velocity(drawn.points, drawn.times, features)
+    return outputs
+
+
+class ImitationPull:
+    """Pulls a policy towards the one that was cloned from demonstrations.
+
+    coef E ||g (v - v_cloned)||^2    at points on the way from drawn latents to the actions taken
+
+    v is the velocity, and g = 1; of DPPO the network's output, which g turns into what the mean of
+    the next step changes by.
+
+    :param policy: The policy that learns.
+    :param parameters: Its parameters when it had been cloned, by name.
+    :param coef: Weight of the pull at the present progress.
+    """
+
+    def __init__(self, policy: Any, parameters: Mapping[str, Any], coef: float) -> None:
+        self._policy, self._coef = policy, coef
+        self._cloned = deepcopy(policy).requires_grad_(False)
+        tensors = {name: th.as_tensor(values) for name, values in parameters.items()}
+        self._cloned.load_state_dict(tensors, strict=False)
+        self._cloned.set_training_mode(False)
+
+    def added_to(
+        self, terms: PolicyTerms, batch: FlowRolloutBufferSamples, features: th.Tensor
+    ) -> PolicyTerms:
+        """The terms of a minibatch with the pull among them.
+
+        :param terms: Those of the algorithm.
+        :param batch: The minibatch of n samples.
+        :param features: The actor's features, shape (n, features_dim).
+        """
+        drawn = self._policy.draw_matching(batch.actions.flatten(1))
+        with th.no_grad():
+            cloned_features = self._cloned.actor_features(batch.observations)
+            cloned = matched_outputs(self._cloned, drawn, cloned_features)
+        change = matched_outputs(self._policy, drawn, features) - cloned
+        loss = (drawn.gains.unsqueeze(-1) * change).square().sum(dim=-1).mean()
+        return terms._replace(
+            regularizer=terms.regularizer + self._coef * loss,
+            metrics={**terms.metrics, "imitation_loss": loss},
+        )
 
 
 class UpdateMetrics:
