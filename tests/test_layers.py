@@ -19,8 +19,9 @@ BELOW: dict[str, set[str]] = {
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
     "export": {"common", "algorithms"},
-    "integrations": {"algorithms", "envs", "policyflow", "resilience"},
-    "benchmark": {"common", "envs", "integrations", "resilience", "__init__"},
+    "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
+    "integrations": {"algorithms", "envs", "imitation", "policyflow", "resilience"},
+    "benchmark": {"common", "envs", "imitation", "integrations", "resilience", "__init__"},
 }
 """What each folder or module of the package may import."""
 

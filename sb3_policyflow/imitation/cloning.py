@@ -1,5 +1,6 @@
 """Cloning: supervised training of a policy's actor on demonstrations."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -11,14 +12,16 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_policyflow.imitation.demonstrations import check_spaces, load_demonstrations
+from sb3_policyflow.imitation.demonstrations import load_demonstrations
+from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
 from sb3_policyflow.imitation.samples import CloningSamples, take_up_statistics
 from sb3_policyflow.imitation.training import CloningRun
+from sb3_policyflow.policyflow import PolicyFlowPolicy
 
 Model = TypeVar("Model", bound=OnPolicyAlgorithm)
 DEFAULT_NOISE = 0.1
-"""PolicyFlow's noise after cloning, in standard deviations of the demonstrated actions."""
+"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds."""
 
 
 def clone(
@@ -58,8 +61,8 @@ def clone(
     :param batch_size: Transitions of a step; all if there are fewer. Default: 1024.
     :param learning_rate: A number, "lin_START", "lin_START_END" or a function of the remaining
         progress. Default: "lin_0.001".
-    :param noise_std: Standard deviation of PolicyFlow's noise when it has been cloned; by default a
-        tenth of that of the demonstrated actions, in each dimension.
+    :param noise_std: Standard deviation of PolicyFlow's noise when it has been cloned, which is
+        what it explores with; by default 0.1 where actions are from -1 to 1, and in proportion.
     :param validation_fraction: Part of the demonstrations that is held out, whole episodes if they
         are known; 0 for none. Default: 0.1.
     :param eval_freq: Gradient steps from one validation to the next. Default: 200.
@@ -80,29 +83,41 @@ def clone(
     run = CloningRun(model, CloningSamples(model, shown), chosen)
     with _prepared(model, callback) as asked:
         run.train(asked, progress_bar)
-    finish(model, shown.actions, chosen.noise_std)
+    finish(model, chosen.noise_std)
     return model
 
 
-def finish(model: Any, actions: np.ndarray, noise_std: float | None) -> None:
+def finish(model: Any, noise_std: float | None) -> None:
     """Let everything that depends on the cloned networks follow them.
 
     :param model: The model.
-    :param actions: The demonstrated actions, shape (n, ...).
     :param noise_std: See :func:`clone`.
     """
     policy = model.policy
-    if hasattr(policy, "noise_log_std") and not policy.gaussian:
-        spread = actions.reshape(len(actions), -1).std(axis=0).clip(min=1e-3)
-        stds = DEFAULT_NOISE * spread if noise_std is None else np.full(len(spread), noise_std)
-        with th.no_grad():
-            policy.log_std.copy_(th.as_tensor(np.log(stds)))
-        policy.keep_within_bounds()
+    if isinstance(policy, PolicyFlowPolicy) and not policy.gaussian:
+        _set_noise(policy, noise_std)
     if hasattr(policy, "freeze_base"):
         policy.freeze_base()
     if hasattr(model, "cloned_parameters"):
         state = policy.state_dict()
         model.cloned_parameters = {name: values.cpu().numpy() for name, values in state.items()}
+
+
+def _set_noise(policy: PolicyFlowPolicy, noise_std: float | None) -> None:
+    box: Any = policy.action_space
+    stds = DEFAULT_NOISE * (box.high - box.low).flatten() / 2
+    if noise_std is not None:
+        stds = np.full_like(stds, noise_std)
+    wanted = th.as_tensor(np.log(stds)).to(policy.log_std)
+    with th.no_grad():
+        policy.log_std.copy_(wanted)
+    policy.keep_within_bounds()
+    if not th.allclose(policy.log_std, wanted):
+        warnings.warn(
+            f"The noise after cloning is {policy.log_std.exp().mean():.3g} and not "
+            f"{wanted.exp().mean():.3g}, because of log_std_bounds={policy.log_std_bounds}.",
+            stacklevel=4,
+        )
 
 
 @contextmanager

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecTransposeImage
 
 from sb3_policyflow.resilience.files import atomic_write
 
@@ -78,27 +76,31 @@ def load_demonstrations(source: Any) -> Demonstrations:
         observations and actions.
     :raises ValueError: If it is nothing of this, or its arrays do not fit together.
     """
+    if isinstance(source, (str, Path)):
+        return _checked(_named(str(source)))
     if isinstance(source, Demonstrations):
         return _checked(source)
-    if isinstance(source, (str, Path)):
-        name = str(source)
-        if name.startswith(MINARI):
-            return _checked(from_minari(name.removeprefix(MINARI)))
-        return _checked(_from_file(Path(source)))
     if hasattr(source, "iterate_episodes"):
         return _checked(from_minari(source))
-    if hasattr(source, "obs") and hasattr(source, "acts"):
+    if _is_transitions(source):
         return _checked(_from_transitions([source]))
+    if isinstance(source, (list, tuple)) and source and all(map(_is_transitions, source)):
+        return _checked(_from_transitions(list(source)))
     if isinstance(source, tuple) and len(source) == 2:
         return _checked(Demonstrations(*source))
-    if isinstance(source, Iterable) and not isinstance(source, Mapping):
-        parts = list(source)
-        if parts and all(hasattr(part, "obs") and hasattr(part, "acts") for part in parts):
-            return _checked(_from_transitions(parts))
     raise ValueError(
         f"Demonstrations must be a name 'minari:DATASET', the path of an .npz file, a Minari "
         f"dataset, transitions with obs and acts, or a pair of arrays, got {type(source).__name__}."
     )
+
+
+def _named(name: str) -> Demonstrations:
+    is_minari = name.startswith(MINARI)
+    return from_minari(name.removeprefix(MINARI)) if is_minari else _from_file(Path(name))
+
+
+def _is_transitions(source: object) -> bool:
+    return hasattr(source, "obs") and hasattr(source, "acts")
 
 
 def _checked(shown: Demonstrations) -> Demonstrations:
@@ -140,6 +142,7 @@ def _from_file(path: Path) -> Demonstrations:
 def _from_transitions(parts: list[Any]) -> Demonstrations:
     """Of objects with ``obs`` and ``acts``; trajectories have one observation more than actions."""
     observations, actions, episodes = [], [], []
+    have_rewards = all(hasattr(part, "rews") for part in parts)
     for number, part in enumerate(parts):
         acts = np.asarray(part.acts)
         observations.append(rows(_as_plain(part.obs), slice(len(acts))))
@@ -149,6 +152,7 @@ def _from_transitions(parts: list[Any]) -> Demonstrations:
         _concatenated(observations),
         np.concatenate(actions),
         np.concatenate(episodes) if len(parts) > 1 else None,
+        np.array([np.sum(part.rews) for part in parts]) if have_rewards else None,
     )
 
 
@@ -205,71 +209,3 @@ def import_minari() -> Any:
             "Minari datasets need the library Minari: pip install 'sb3-policyflow[minari]'."
         ) from error
     return minari
-
-
-def check_spaces(shown: Demonstrations, model: Any) -> None:
-    """Refuse demonstrations that a model could not have made.
-
-    :param shown: The demonstrations.
-    :param model: An SB3 algorithm.
-    :raises ValueError: With both spaces.
-    """
-    pairs = (
-        ("observations", shown.observations, shown.observation_space, model.observation_space),
-        ("actions", shown.actions, shown.action_space, model.action_space),
-    )
-    for name, values, space, wanted in pairs:
-        if _fits(values, space, wanted, has_bounds=name == "actions"):
-            continue
-        theirs = space or _described(values)
-        raise ValueError(
-            f"The demonstrations do not fit the model: their {name} are {theirs}, the model's are "
-            f"{wanted}. Use demonstrations of the environment that the model is made for, with the "
-            "same wrappers."
-        )
-
-
-def _described(values: Observations) -> str:
-    if isinstance(values, dict):
-        return str({key: _described(part) for key, part in values.items()})
-    return f"arrays of shape {values.shape[1:]} and dtype {values.dtype}"
-
-
-def _fits(
-    values: Observations,
-    space: spaces.Space[Any] | None,
-    wanted: spaces.Space[Any],
-    has_bounds: bool = False,
-) -> bool:
-    """Whether values, and their space if it is known, are those of another space."""
-    if isinstance(wanted, spaces.Dict):
-        if not isinstance(values, dict) or values.keys() != wanted.spaces.keys():
-            return False
-        parts: Any = space.spaces if isinstance(space, spaces.Dict) else dict.fromkeys(values)
-        return all(_fits(values[key], parts.get(key), wanted[key]) for key in values)
-    if isinstance(values, dict):
-        return False
-    if isinstance(wanted, spaces.Box):
-        shapes = {wanted.shape}
-        if is_image_space(wanted, check_channels=True):
-            height_last = spaces.Box(0, 255, (*wanted.shape[1:], wanted.shape[0]), np.uint8)
-            if VecTransposeImage.transpose_space(height_last).shape == wanted.shape:
-                shapes.add(height_last.shape)
-        are_alike = values.shape[1:] in shapes and (values.dtype == np.uint8) == (
-            wanted.dtype == np.uint8
-        )
-        if not has_bounds or not isinstance(space, spaces.Box):
-            return are_alike and (space is None or isinstance(space, spaces.Box))
-        same = space.shape == wanted.shape
-        return (
-            are_alike and same and np.allclose([space.low, space.high], [wanted.low, wanted.high])
-        )
-    return (space is None or space == wanted) and all(
-        wanted.contains(value) for value in _values_of(wanted, values[:100])
-    )
-
-
-def _values_of(space: spaces.Space[Any], values: np.ndarray) -> list[Any]:
-    """Values in the form that a discrete space contains them."""
-    shape = space.shape or ()
-    return list(values.reshape(len(values), *shape).astype(space.dtype))

@@ -1,5 +1,6 @@
 """What makes a policy's actions those that were demonstrated."""
 
+import math
 from typing import Any
 
 import torch as th
@@ -7,6 +8,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.update import matched_outputs
+from sb3_policyflow.flows import MatchingSamples
+from sb3_policyflow.policyflow import PolicyFlowPolicy
+
+HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 def cloning_losses(policy: Any, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
@@ -21,20 +26,21 @@ def cloning_losses(policy: Any, observations: PyTorchObs, actions: th.Tensor) ->
     :param actions: Demonstrated actions as the policy makes them, shape (n, ...).
     """
     if not isinstance(policy, FlowPolicy):
-        _, log_prob, _ = policy.evaluate_actions(observations, actions)
+        log_prob: th.Tensor = policy.evaluate_actions(observations, actions)[1]
         return -log_prob
     features = policy.actor_features(observations)
     actions = actions.flatten(1)
-    if getattr(policy, "gaussian", False):
+    if isinstance(policy, PolicyFlowPolicy) and policy.gaussian:
         return gaussian_losses(policy, features, actions)
-    drawn = policy.draw_matching(actions)
+    own: Any = policy
+    drawn: MatchingSamples = own.draw_matching(actions)
     error = matched_outputs(policy, drawn, features) - drawn.targets
     return drawn.weights * error.square().sum(dim=-1)
 
 
-def gaussian_losses(policy: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+def gaussian_losses(policy: PolicyFlowPolicy, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Minus the log likelihood of actions around the end point of the latent 0, shape (n,)."""
     latents = features.new_zeros(len(features), policy.action_dim)
-    means = policy.transport(latents, features)
-    normal = th.distributions.Normal(means, policy.noise_log_std.exp())
-    return -normal.log_prob(actions).sum(dim=-1)
+    noise = (actions - policy.transport(latents, features)) / policy.noise_log_std.exp()
+    log_scales = policy.noise_log_std + HALF_LOG_2_PI
+    return (0.5 * noise.square() + log_scales).sum(dim=-1)

@@ -91,7 +91,7 @@ class CloningRun:
         loss = cloning_losses(self._policy, *self._samples.batch(self._next_batch())).mean()
         for parameter in self._parameters:
             parameter.grad = None
-        loss.backward()
+        th.autograd.backward(loss)
         norm = clip_gradients(self._parameters, self._model.max_grad_norm)
         if not (math.isfinite(loss.item()) and math.isfinite(norm)):
             raise FloatingPointError(
@@ -197,7 +197,7 @@ def _bar(options: CloningOptions, is_shown: bool) -> Iterator[Callable[[int], ob
     :raises ImportError: If it is to be shown, and tqdm is not installed.
     """
     if not is_shown:
-        yield lambda n_steps: None
+        yield lambda _: None
         return
     try:
         from tqdm import tqdm

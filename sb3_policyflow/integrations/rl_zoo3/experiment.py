@@ -15,6 +15,7 @@ import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
+from sb3_policyflow.integrations.rl_zoo3.cloning import CloningBeforeTraining
 
 
 def extend_experiment(manager: Any, own_algorithms: Container[str], config_given: bool) -> None:
@@ -26,6 +27,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
     """
     env_id = manager.env_name.gym_id
     is_own_algorithm = manager.algo in own_algorithms
+    CloningBeforeTraining(manager)
     if not config_given:
         manager.config = choose_config(manager.algo, env_id, manager.config)
     # Any other class than DummyVecEnv has been chosen explicitly.
