@@ -174,6 +174,8 @@ def _save_minari(episodes: Sequence[Episode], name: str, env: VecEnv, env_id: st
         name,
         buffers,
         env=env_id,
+        eval_env=env_id,
+        description="Episodes recorded by sb3_policyflow.imitation.",
         observation_space=env.observation_space,
         action_space=env.action_space,
         jpeg_encoding=False,

@@ -146,7 +146,7 @@ def mixture(n: int) -> tuple[np.ndarray, np.ndarray]:
     [
         (PolicyFlow, {"interpolant": "trigflow", "latent_std": 0.5}),
         (FPO, {"solver": "midpoint"}),
-        (DPPO, {"n_denoising_steps": 20, "min_sampling_std": 0.02}),
+        (DPPO, {"process": "flow", "n_denoising_steps": 20, "min_sampling_std": 1e-3}),
     ],
 )
 def test_a_mixture_that_depends_on_the_observation(
@@ -156,7 +156,7 @@ def test_a_mixture_that_depends_on_the_observation(
     model = algorithm("MlpPolicy", "MultiGoal-v0", policy_kwargs=policy_kwargs, seed=0, **options)
     clone(
         model,
-        mixture(40_000),
+        mixture(30_000),
         gradient_steps=1500,
         learning_rate="lin_0.003",
         validation_fraction=0,
