@@ -44,7 +44,6 @@ STEPS = {"good": 1e6, "slow": 5e6}
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "policyflow": {
-        "learning_rate": 3e-4,
         "desired_kl": None,
         "lr_adaptation_kwargs": None,
         "ent_coef": 0.0,
@@ -57,8 +56,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 }
 """What differs from the YAML files, by algorithm. Values of up to 10 are not clipped by 100."""
 OF_POLICYFLOW: dict[str, dict[str, Any]] = {
-    "good": {"brownian_coef": 0.02, "imitation_kwargs": {"noise_std": 0.3}},
-    "slow": {"brownian_coef": 0.05, "imitation_kwargs": {"noise_std": 0.5}},
+    "good": {"learning_rate": 1e-4, "brownian_coef": 0.02, "imitation_kwargs": {"noise_std": 0.3}},
+    "slow": {"learning_rate": 3e-4, "brownian_coef": 0.05, "imitation_kwargs": {"noise_std": 0.5}},
 }
 """And by demonstrator. The noise explores, and from good demonstrations there is little to find."""
 
