@@ -52,7 +52,8 @@ def main(arguments: list[str] | None = None) -> None:
             verbose=options.verbose,
             show_progress=options.progress,
         )
-        model: Any = manager.setup_experiment()[0]  # type: ignore[index]  # None for sweeps alone
+        made: Any = manager.setup_experiment()
+        model = made[0]
         model.save(out)
         normalize = model.get_vec_normalize_env()
         if normalize is not None:

@@ -60,8 +60,8 @@ class Demonstrations(NamedTuple):
             np.savez_compressed(file, **arrays)
 
 
-def rows(observations: Observations, indices: np.ndarray | slice) -> Observations:
-    """Some rows of an array or of a dictionary of arrays."""
+def rows(observations: Observations, indices: Any) -> Observations:
+    """One or some rows of an array or of a dictionary of arrays."""
     if isinstance(observations, dict):
         return {key: values[indices] for key, values in observations.items()}
     return observations[indices]

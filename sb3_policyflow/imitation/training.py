@@ -175,7 +175,8 @@ class CloningRun:
         path = self._options.checkpoint
         if path is None or not Path(path).is_file():
             return
-        state = th.load(path, map_location=self._model.device, weights_only=False)
+        # The states of random generators belong on the CPU, and the others find their device.
+        state = th.load(path, map_location="cpu", weights_only=False)
         if state["settings"] != self._settings():
             raise ValueError(
                 f"{path} is of a cloning with other options, demonstrations or networks: delete "
