@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -119,28 +117,31 @@ def imitation_table(results: Sequence[Result]) -> str:
     return f"{markdown_table(HEADER, rows)}\n\n{seeds_caption(results)}\n"
 
 
+QUANTITIES = {"return": ".2f", "mean_return": ".2f", "n_goals": ".2g", "entropy": ".2f"}
+"""Columns of the table, each before and after the training, with the digits that they have."""
+
+
 def _row(name: str, results: Sequence[Result]) -> list[str]:
     style, algo = name.split("-")
     row = [style, algo, str(len(results)), f"{results[0].run.steps:,}"]
-    after = [
-        {"return": r.summary["final"]["stochastic"]["mean_return"], **r.summary["goals"]}
-        for r in results
-    ]
-    before = [
-        {"return": r.summary["cloned"]["mean_return"], **r.summary["cloned"]["goals"]}
-        for r in results
-    ]
-    for quantity, digits in (
-        ("return", ".2f"),
-        ("mean_return", ".2f"),
-        ("n_goals", ".2g"),
-        ("entropy", ".2f"),
-    ):
-        row += [
-            over_seeds([np.float64(each[quantity]).item() for each in stage]).format(digits)
-            for stage in (before, after)
+    stages = [
+        [
+            {"return": evaluation["mean_return"], **goals}
+            for evaluation, goals in (_stage(result.summary, is_trained) for result in results)
         ]
+        for is_trained in (False, True)
+    ]
+    for quantity, digits in QUANTITIES.items():
+        for stage in stages:
+            row.append(over_seeds([float(each[quantity]) for each in stage]).format(digits))
     return row
+
+
+def _stage(summary: dict[str, Any], is_trained: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The evaluation from random starts, and the goals from the center, before or after."""
+    if is_trained:
+        return summary["final"]["stochastic"], summary["goals"]
+    return summary["cloned"], summary["cloned"]["goals"]
 
 
 def draw(folder: Path, results: Sequence[Result]) -> None:

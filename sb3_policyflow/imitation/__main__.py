@@ -23,37 +23,15 @@ def main(arguments: list[str] | None = None) -> None:
 
     :param arguments: Arguments of the command line; those of the process if not given.
     """
-    # Only now: the names that it knows depend on what has been registered.
-    from rl_zoo3.exp_manager import ExperimentManager
+    # Only now: the names that rl_zoo3 knows depend on what has been registered.
     from rl_zoo3.utils import StoreDict
 
     options = _parser(StoreDict).parse_args(arguments)
     out = Path(options.out).with_suffix(".zip")
-    given = dict(options.hyperparams)
-    cloning = {"checkpoint": str(out.with_suffix(".cloning")), **given.pop("imitation_kwargs", {})}
-    if options.gradient_steps is not None:
-        cloning["gradient_steps"] = options.gradient_steps
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as logs:
-        manager = ExperimentManager(
-            options,
-            options.algo,
-            options.env,
-            logs,
-            eval_freq=-1,
-            hyperparams={
-                **given,
-                "demonstrations": options.dataset,
-                "imitation_kwargs": cloning,
-            },
-            seed=options.seed,
-            device=options.device,
-            config=options.conf_file,
-            verbose=options.verbose,
-            show_progress=options.progress,
-        )
-        made: Any = manager.setup_experiment()
-        model = made[0]
+        manager = _experiment(options, out, logs)
+        model = manager.setup_experiment()[0]
         model.save(out)
         normalize = model.get_vec_normalize_env()
         if normalize is not None:
@@ -62,6 +40,29 @@ def main(arguments: list[str] | None = None) -> None:
             normalize.save(folder / "vecnormalize.pkl")
         model.get_env().close()
     sys.stdout.write(f"Wrote {out}\n")
+
+
+def _experiment(options: argparse.Namespace, out: Path, logs: str) -> Any:
+    """rl_zoo3's experiment, which clones when it is set up."""
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    given = dict(options.hyperparams)
+    cloning = {"checkpoint": str(out.with_suffix(".cloning")), **given.pop("imitation_kwargs", {})}
+    if options.gradient_steps is not None:
+        cloning["gradient_steps"] = options.gradient_steps
+    return ExperimentManager(
+        options,
+        options.algo,
+        options.env,
+        logs,
+        eval_freq=-1,
+        hyperparams={**given, "demonstrations": options.dataset, "imitation_kwargs": cloning},
+        seed=options.seed,
+        device=options.device,
+        config=options.conf_file,
+        verbose=options.verbose,
+        show_progress=options.progress,
+    )
 
 
 def _parser(store_dict: type[argparse.Action]) -> argparse.ArgumentParser:

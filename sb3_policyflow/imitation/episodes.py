@@ -153,30 +153,28 @@ def as_demonstrations(episodes: Sequence[Episode], env: VecEnv) -> Demonstration
 
 
 def _save_minari(episodes: Sequence[Episode], name: str, env: VecEnv, env_id: str | None) -> None:
-    minari = import_minari()
-    from minari.data_collector import EpisodeBuffer
-
-    buffers = []
-    for number, episode in enumerate(episodes):
-        ends = np.zeros(len(episode.acts), dtype=bool)
-        ends[-1] = True
-        buffers.append(
-            EpisodeBuffer(
-                id=number,
-                observations=episode.obs,
-                actions=episode.acts,
-                rewards=list(episode.rews),
-                terminations=list(ends & episode.terminal),
-                truncations=list(ends & (not episode.terminal)),
-            )
-        )
-    minari.create_dataset_from_buffers(
+    import_minari().create_dataset_from_buffers(
         name,
-        buffers,
+        [_minari_buffer(number, episode) for number, episode in enumerate(episodes)],
         env=env_id,
         eval_env=env_id,
         description="Episodes recorded by sb3_policyflow.imitation.",
         observation_space=env.observation_space,
         action_space=env.action_space,
         jpeg_encoding=False,
+    )
+
+
+def _minari_buffer(number: int, episode: Episode) -> Any:
+    from minari.data_collector import EpisodeBuffer
+
+    ends = np.zeros(len(episode.acts), dtype=bool)
+    ends[-1] = True
+    return EpisodeBuffer(
+        id=number,
+        observations=episode.obs,
+        actions=episode.acts,
+        rewards=list(episode.rews),
+        terminations=list(ends & episode.terminal),
+        truncations=list(ends & (not episode.terminal)),
     )

@@ -11,10 +11,11 @@ The model is found and loaded as ``rl_zoo3.enjoy`` does it.
 import argparse
 import os
 import sys
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.imitation.episodes import record, save_episodes
@@ -25,11 +26,23 @@ def main(arguments: list[str] | None = None) -> None:
 
     :param arguments: Arguments of the command line; those of the process if not given.
     """
-    # Only now: the names that it knows depend on what has been registered.
+    options = _parser().parse_args(arguments)
+    model, env = _load(options)
+    episodes = record(model, env, options.episodes, options.deterministic)
+    save_episodes(episodes, options.out, env, options.env)
+    returns = [episode.rews.sum() for episode in episodes]
+    sys.stdout.write(
+        f"Wrote {len(episodes)} episodes with a mean return of {np.mean(returns):.2f} to "
+        f"{options.out}\n"
+    )
+
+
+def _load(options: argparse.Namespace) -> tuple[Any, VecEnv]:
+    """The model of a run of rl_zoo3, and the environment that it was trained in."""
+    # Only now: the names that rl_zoo3 knows depend on what has been registered.
     from huggingface_sb3 import EnvironmentName
     from rl_zoo3.utils import ALGOS, create_test_env, get_model_path, get_saved_hyperparams
 
-    options = _parser().parse_args(arguments)
     ensure_registered(options.env)
     name = EnvironmentName(options.env)
     _, model_path, log_path = get_model_path(
@@ -38,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
     hyperparams, stats_path = get_saved_hyperparams(os.path.join(log_path, name), test_mode=True)
     set_random_seed(options.seed)
     env = create_test_env(
-        name.gym_id,
+        options.env,
         n_envs=options.n_envs,
         stats_path=stats_path,
         seed=options.seed,
@@ -48,14 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
         hyperparams=hyperparams,
         vec_env_cls=DummyVecEnv,
     )
-    model = ALGOS[options.algo].load(model_path, device="cpu")
-    episodes = record(model, env, options.episodes, options.deterministic)
-    save_episodes(episodes, options.out, env, name.gym_id)
-    returns = [episode.rews.sum() for episode in episodes]
-    sys.stdout.write(
-        f"Wrote {len(episodes)} episodes with a mean return of {np.mean(returns):.2f} to "
-        f"{options.out}\n"
-    )
+    return ALGOS[options.algo].load(model_path, device="cpu"), env
 
 
 def _parser() -> argparse.ArgumentParser:

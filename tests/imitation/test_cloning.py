@@ -18,20 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.imitation import clone
 from tests.helpers import SMALL, TINY, learned, weights
-
-ALGORITHMS = [PolicyFlow, FPO, DPPO]
-SHORT: dict[str, Any] = {"gradient_steps": 40, "batch_size": 32, "eval_freq": 10}
-
-
-def shown(n: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    observations = rng.standard_normal((n, 3)).astype(np.float32)
-    return observations, np.tanh(observations[:, :1])
-
-
-def pendulum(algorithm: type[Any], **options: Any) -> Any:
-    policy_kwargs = {**TINY, **options.pop("policy_kwargs", {})}
-    return algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, **SMALL | options)
+from tests.imitation.short import ALGORITHMS, SHORT, pendulum, shown
 
 
 class Interruption(BaseCallback):
@@ -148,7 +135,10 @@ def test_a_gaussian_learns_mean_and_deviation() -> None:
     observations = rng.standard_normal((4096, 3)).astype(np.float32)
     actions = 0.5 + 0.3 * rng.standard_normal((4096, 1))
     options = {"gradient_steps": 300, "learning_rate": "lin_0.02", "batch_size": 256}
-    for model in (pendulum(PolicyFlow, gaussian=True), PPO("MlpPolicy", "Pendulum-v1", seed=0)):
+    for model in (
+        pendulum(PolicyFlow, gaussian=True, n_flow_steps=2),
+        PPO("MlpPolicy", "Pendulum-v1", seed=0),
+    ):
         clone(model, (observations, actions), **options)
         drawn = model.predict(np.zeros((4096, 3), np.float32))[0]
         assert drawn.mean() == pytest.approx(0.5, abs=0.05)
@@ -312,38 +302,3 @@ def test_discrete_observations() -> None:
     clone(model, (np.arange(10) % 5, actions), gradient_steps=2)
     with pytest.raises(ValueError, match=r"the model's are Discrete\(5\)"):
         clone(model, (np.arange(10), actions))
-
-
-# The pull
-
-
-def test_a_pull_needs_a_cloned_policy() -> None:
-    with pytest.raises(ValueError, match="this model was not: call"):
-        pendulum(PolicyFlow, imitation_coef=0.1).learn(16)
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_pull_is_zero_where_it_begins(algorithm: type[Any]) -> None:
-    model = clone(pendulum(algorithm, imitation_coef=1.0, n_critic_warmup=1), shown(), **SHORT)
-    model.set_logger(configure(None, []))
-    model.learn(16)
-    assert model.logger.name_to_value["train/imitation_loss"] == 0.0
-    model.learn(16, reset_num_timesteps=False)
-    assert model.logger.name_to_value["train/imitation_loss"] > 0.0
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_pull_holds_the_policy_back(algorithm: type[Any], tmp_path: Path) -> None:
-    moved = {}
-    for coef in (0.0, "lin_1000_1000"):
-        options: dict[str, Any] = {"n_epochs": 8, "learning_rate": 3e-3, "imitation_coef": coef}
-        model = clone(pendulum(algorithm, **options), shown(), **SHORT)
-        # The policy to which it is pulled is in the file.
-        model.save(tmp_path / "model")
-        model = algorithm.load(tmp_path / "model", env=gym.make("Pendulum-v1"))
-        latents, features = th.randn(64, 1), th.randn(64, 3)
-        before = model.policy.transport(latents, features).detach()
-        model.learn(64)
-        change = model.policy.transport(latents, features).detach() - before
-        moved[coef] = change.square().mean().item()
-    assert moved["lin_1000_1000"] < 0.2 * moved[0.0]

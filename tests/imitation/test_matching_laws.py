@@ -157,7 +157,7 @@ def test_a_mixture_that_depends_on_the_observation(
     clone(
         model,
         mixture(30_000),
-        gradient_steps=1500,
+        gradient_steps=2000,
         learning_rate="lin_0.003",
         validation_fraction=0,
         **({"noise_std": 1e-3} if algorithm is PolicyFlow else {}),
@@ -172,7 +172,7 @@ def test_a_mixture_that_depends_on_the_observation(
         for index, center in enumerate(CENTERS):
             of_mode = actions[nearest == index]
             assert (of_mode.mean(dim=0) - center).norm().item() < 0.1
-            assert of_mode.std(dim=0).tolist() == pytest.approx([0.3, 0.3], abs=0.08)
+            assert of_mode.std(dim=0).tolist() == pytest.approx([0.3, 0.3], abs=0.1)
 
 
 def act(observations: np.ndarray) -> np.ndarray:
@@ -185,7 +185,7 @@ def act(observations: np.ndarray) -> np.ndarray:
     ("algorithm", "options"),
     [
         (PolicyFlow, {}),
-        (PolicyFlow, {"gaussian": True}),
+        (PolicyFlow, {"gaussian": True, "n_flow_steps": 2}),
         (PolicyFlow, {"interpolant": "stochastic"}),
         (FPO, {}),
         (DPPO, {"process": "ddpm"}),
