@@ -22,6 +22,7 @@ from sb3_policyflow.common.update import (
     FlowUpdate,
     Loss,
     UpdateMetrics,
+    check_model,
     check_step,
     clip_gradients,
     take_step,
@@ -48,6 +49,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
+    :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
+        from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -110,6 +114,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
+        n_critic_warmup: int = 0,
+        imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -123,6 +129,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
+        self.n_critic_warmup = n_critic_warmup
+        self.imitation_coef = imitation_coef
+        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
         self.has_former_defaults = False  # an attribute of files
         self.n_rollouts = 0
@@ -166,8 +175,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         if self.clip_range_vf is not None:
             self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
-        for check in self.model_checks:
-            check(self)
+        check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)

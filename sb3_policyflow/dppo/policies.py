@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.flows import MatchingSamples
 from sb3_policyflow.flows.bounds import SHORTEST_MEANINGLESS
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
 
@@ -248,6 +249,10 @@ class DPPOPolicy(FlowPolicy):
             trained, base = features.tensor_split(2, dim=-1)
             features = base if is_frozen else trained
         return self.chain.means(points, network(points, self.chain.times[steps], features), steps)
+
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where denoising is trained on the way to end points of the chain (n, dim)."""
+        return self.chain.draw_matching(endpoints)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.flows import SOLVERS, Flow, Rectified
+from sb3_policyflow.flows import SOLVERS, Flow, MatchingSamples, Rectified, draw_matching
 
 
 class FPOOptions(FlowOptions, total=False):
@@ -80,6 +80,10 @@ class FPOPolicy(FlowPolicy):
     def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
         """End points of the flow, see :meth:`FlowPolicy.transport`."""
         return self.flow.solve(latents, features)
+
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
+        return draw_matching(self.flow.interpolant, endpoints)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

@@ -13,7 +13,7 @@ from torch import nn
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions, accepts_former_names
 from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
-from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
+from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow, MatchingSamples, draw_matching
 from sb3_policyflow.flows.bounds import half_ranges
 
 
@@ -168,6 +168,10 @@ class PolicyFlowPolicy(BaseFlowPolicy):
     def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
         """End points phi, see :meth:`FlowPolicy.transport`."""
         return self.flow.solve(latents, features)
+
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
+        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

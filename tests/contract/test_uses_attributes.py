@@ -43,6 +43,8 @@ SHARED: dict[str, Any] = {
     "advantage_scope": "rollout",
     "timeout_bootstrap": "none",
     "n_steps": 24,
+    "n_critic_warmup": 1,
+    "imitation_coef": 50.0,
 }
 DRAWN: dict[str, Any] = {"n_entropy_actions": 3, "n_entropy_states": 2}
 OWN: dict[type[Any], dict[str, Any]] = {
@@ -72,7 +74,6 @@ OWN: dict[type[Any], dict[str, Any]] = {
         "denoising_gamma": 0.5,
         "clip_range_base": 1e-4,
         "clip_range_rate": 30.0,
-        "n_critic_warmup": 1,
         **DRAWN,
     },
 }
@@ -124,7 +125,12 @@ def new(algorithm: type[Any], **options: Any) -> Any:
     """A model; one whose sizes do not divide each other warns, which is not the matter here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return make(algorithm, steps(2), **{**SIZES, **options})
+        model = make(algorithm, steps(2), **{**SIZES, **options})
+    if algorithm is not PPO:
+        # The policy is pulled towards what it was at the beginning, as if that had been cloned.
+        state = model.policy.state_dict()
+        model.cloned_parameters = {name: part.numpy().copy() for name, part in state.items()}
+    return model
 
 
 def trained(model: Any, callback: Any = None) -> th.Tensor:

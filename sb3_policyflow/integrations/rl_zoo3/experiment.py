@@ -23,6 +23,7 @@ from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.callbacks import warn_of_deterministic_actions
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
 from sb3_policyflow.hints import did_you_mean
+from sb3_policyflow.integrations.rl_zoo3.cloning import CloningBeforeTraining
 from sb3_policyflow.integrations.rl_zoo3.samplers import TASK, Task
 
 ZOO_KEYS = (
@@ -49,6 +50,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
     """
     env_id = manager.env_name.gym_id
     is_own_algorithm = manager.algo in own_algorithms
+    CloningBeforeTraining(manager)
     if not config_given:
         manager.config = choose_config(manager.algo, env_id, manager.config)
     # Any other class than DummyVecEnv has been chosen explicitly.
