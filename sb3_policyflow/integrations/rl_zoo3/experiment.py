@@ -28,10 +28,12 @@ from sb3_policyflow.integrations.rl_zoo3.samplers import TASK, Task
 
 ZOO_KEYS = (
     "callback",
+    "demonstrations",
     "deterministic_eval",
     "env_kwargs",
     "env_wrapper",
     "frame_stack",
+    "imitation_kwargs",
     "monitor_kwargs",
     "n_envs",
     "n_timesteps",
