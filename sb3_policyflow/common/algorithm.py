@@ -1,12 +1,12 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
+from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
@@ -22,6 +22,7 @@ from sb3_policyflow.common.update import (
     FlowUpdate,
     Loss,
     UpdateMetrics,
+    check_model,
     check_step,
     clip_gradients,
     take_step,
@@ -34,8 +35,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
-    supported, ``max_grad_norm`` may be None or not positive for no clipping, and ``ent_coef`` may
-    be a schedule; and:
+    supported, ``max_grad_norm`` may be None or not positive for no clipping, and coefficients and
+    rates may be schedules, also as "lin_START" or "lin_START_END"; and:
 
     :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
         a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
@@ -48,6 +49,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
+    :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
+        from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -56,6 +60,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
+    former_values: ClassVar[Mapping[str, Any]] = {"has_former_defaults": True}
+    has_former_defaults: bool = False
+    """Whether a file of version 0.1 was loaded: what it does not say, had other defaults."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
@@ -69,7 +76,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name in names.settable_options(cls.policy_base):
+        for name in {"random_latents", *names.settable_options(cls.policy_base)}:
             if not hasattr(cls, name):
                 setattr(cls, name, options.PolicyOption(name))
 
@@ -77,14 +84,14 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self,
         policy: str | type[FlowPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: Coefficient = 3e-4,
         n_steps: int = 2048,
         batch_size: int = 64,
         n_epochs: int = 10,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
+        clip_range: Coefficient = 0.2,
+        clip_range_vf: Coefficient | None = None,
         normalize_advantage: bool = True,
         ent_coef: Coefficient = 0.0,
         vf_coef: float = 0.5,
@@ -107,6 +114,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
+        n_critic_warmup: int = 0,
+        imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -120,14 +129,18 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
+        self.n_critic_warmup = n_critic_warmup
+        self.imitation_coef = imitation_coef
+        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
+        self.has_former_defaults = False  # an attribute of files
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
         self._adaptive_start: float | None = None
         super().__init__(
             policy,
             env,
-            learning_rate=learning_rate,
+            learning_rate=cast(float, learning_rate),  # may be a string here
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -149,6 +162,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         options.read_loaded_options(self)
+        names.keep_former_defaults(self)
         options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
@@ -157,12 +171,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         super()._setup_model()
         self.policy_kwargs = own
         self.known_policy_options = options.values_on_policy(self)
-        self.clip_range = FloatSchedule(self.clip_range)
+        self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:
-            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+            self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
-        for check in self.model_checks:
-            check(self)
+        check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
@@ -176,7 +189,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         return float(schedule(self._current_progress_remaining))
 
     def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
+        self.lr_schedule = parse_schedule("learning_rate", self.learning_rate)
         self._learning_rates = self.learning_rate, self.lr_schedule
 
     def read_learning_rate(self) -> None:

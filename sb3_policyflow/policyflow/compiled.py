@@ -22,22 +22,24 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     :param update: The update, with the formulas of its class.
     :return: None if it has terms that no kernel knows.
     """
-    policy, interpolant = update.policy, update.flow.interpolant
+    policy, interpolant, latent_std = update.policy, update.flow.interpolant, update.latent_std
     has_known_formulas = (
         SURROGATES[update.trust_region] is clipped_surrogate
         and update.uniform_targets is None
-        and isinstance(update.clip_range, float)
         and type(policy).values is FlowPolicy.values
         and type(interpolant).brownian_residual is Interpolant.brownian_residual
     )
-    if not has_known_formulas:
+    clip_range = update.clip_range
+    if not has_known_formulas or not isinstance(clip_range, float):
+        return None
+    if isinstance(latent_std, th.Tensor):
         return None
     unbounded = math.inf
     options = LossOptions(
         end_time=interpolant.end_time,
-        latent_std=policy.latent_std,
+        latent_std=float(latent_std),
         averages_shift=update.time_average == "shift",
-        clip_range=update.clip_range,
+        clip_range=clip_range,
         log_ratio_clamp=unbounded if update.log_ratio_clamp is None else update.log_ratio_clamp,
         brownian_coef=update.brownian_coef,
         sums_dimensions=update.brownian_reduction == "sum",
@@ -68,7 +70,8 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         if evaluated is None:
             return None
         means = evaluated.terms._asdict()
-        kl, maxima = th.tensor(means.pop("kl")), {"log_ratio_max": means.pop("log_ratio_max")}
+        kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
+        maxima = {"log_ratio_max": means.pop("log_ratio_max")}
         means["entropy_loss"] = -means.pop("entropy")
         return CompiledTerms(evaluated, kl, means, maxima)
 

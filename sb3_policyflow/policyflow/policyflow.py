@@ -59,6 +59,7 @@ class PolicyFlowUpdate(FlowUpdate):
         super().__init__(algorithm, rollout)
         policy = algorithm.policy
         self.flow = policy.flow
+        self.latent_std = 1.0 if policy.gaussian else policy.latent_scale
         # Line 3: the reference policy, theta-hat and sigma-hat. Its features are extracted once.
         self.reference_field = deepcopy(policy.velocity)
         self.reference_log_std = policy.noise_log_std.detach().clone()
@@ -126,7 +127,7 @@ class PolicyFlowUpdate(FlowUpdate):
         :param velocity: v there, shape (n, k, action_dim).
         """
         eta = self.flow.interpolant.brownian_residual(
-            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.policy.latent_std
+            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.latent_std
         )
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)
