@@ -139,7 +139,8 @@ class LossTargets(NamedTuple):
 
     Of PolicyFlow's actor, with k rows for each sample: ``actions`` and ``endpoints`` (m, dim),
     ``advantages`` (m,), ``reference_velocity`` (m k, dim), ``scores`` (n_entries, 3), the
-    interpolant's score coefficients at each distinct time, ``log_std`` and ``old_log_std`` (dim,).
+    interpolant's score coefficients at each distinct time, ``latent_std``, ``log_std`` and
+    ``old_log_std`` (dim,).
     Of the critic: ``old_values`` and ``returns`` (m,).
     """
 
@@ -148,6 +149,7 @@ class LossTargets(NamedTuple):
     advantages: Floats
     reference_velocity: Floats
     scores: Floats
+    latent_std: Floats
     log_std: Floats
     old_log_std: Floats
     old_values: Floats
@@ -157,13 +159,12 @@ class LossTargets(NamedTuple):
 class LossOptions(NamedTuple):
     """Options of the losses of actor and critic.
 
-    The ``end_time`` of the interpolant, the ``latent_std``, whether the mean shift over a sample's
+    The ``end_time`` of the interpolant, whether the mean shift over a sample's
     times has one surrogate (``averages_shift``), infinity for bounds that there are not,
     ``sums_dimensions`` of the Brownian regularizer, and the weights of regularizers and critic.
     """
 
     end_time: float
-    latent_std: float
     averages_shift: bool
     clip_range: float
     log_ratio_clamp: float

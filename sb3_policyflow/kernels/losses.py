@@ -39,7 +39,7 @@ class LossInputs(NamedTuple):
     ``features`` and ``critic_features`` (m, ...) and ``log_std`` (dim,) may have gradients.
     ``times`` (m, k), ``points`` and ``reference_velocity`` (m, k, dim), ``actions`` and
     ``endpoints`` (m, dim), ``advantages``, ``old_values`` and ``returns`` (m,), ``old_log_std``
-    (dim,) have none.
+    and ``latent_std`` (dim,) have none.
     """
 
     features: th.Tensor
@@ -54,6 +54,7 @@ class LossInputs(NamedTuple):
     old_values: th.Tensor
     returns: th.Tensor
     old_log_std: th.Tensor
+    latent_std: th.Tensor
 
 
 class LossTerms(NamedTuple):
@@ -138,6 +139,7 @@ class EvaluatedLoss:
             arrays.advantages,
             arrays.reference_velocity.reshape(-1, actor.dim),
             th.stack(loss.scores(th.from_numpy(self._embedding.times)), dim=1).numpy(),
+            arrays.latent_std,
             arrays.log_std,
             arrays.old_log_std,
             arrays.old_values,

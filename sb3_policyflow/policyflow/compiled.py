@@ -32,12 +32,9 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     clip_range = update.clip_range
     if not has_known_formulas or not isinstance(clip_range, float):
         return None
-    if isinstance(latent_std, th.Tensor):
-        return None
     unbounded = math.inf
     options = LossOptions(
         end_time=interpolant.end_time,
-        latent_std=float(latent_std),
         averages_shift=update.time_average == "shift",
         clip_range=clip_range,
         log_ratio_clamp=unbounded if update.log_ratio_clamp is None else update.log_ratio_clamp,
@@ -47,6 +44,7 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         vf_coef=update.vf_coef,
         clip_range_vf=unbounded if update.clip_range_vf is None else update.clip_range_vf,
     )
+    latent_std = latent_std * th.ones_like(update.reference_log_std)
     loss = KernelLoss(options, interpolant.score_coefficients)
 
     def compiled_loss(
@@ -65,6 +63,7 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
             old_values=batch.old_values,
             returns=batch.returns,
             old_log_std=update.reference_log_std,
+            latent_std=latent_std,
         )
         evaluated = loss(policy, inputs)
         if evaluated is None:

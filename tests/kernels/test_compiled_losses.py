@@ -63,6 +63,16 @@ def test_loss_metrics_and_gradients(case: str) -> None:
     assert_close(compiled, evaluated(model, update, batch))
 
 
+def test_latents_that_differ_between_dimensions(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, rollout = collected(PolicyFlow, brownian_coef=0.2)
+    monkeypatch.setattr(type(model.policy), "latent_scale", th.tensor([0.7]))
+    update = PolicyFlowUpdate(model, rollout)
+    batch = rollout._replace(drawn=update.draw())
+    compiled = evaluated(model, update, batch)
+    update.compiled_loss = None
+    assert_close(compiled, evaluated(model, update, batch))
+
+
 def test_gradients_go_on_to_a_features_extractor() -> None:
     model, update, batch = prepared()
     layer = nn.Linear(3, 3)

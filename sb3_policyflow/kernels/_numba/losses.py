@@ -217,13 +217,13 @@ def _regularize(
     """Add a row's change of the velocity and its Brownian regularizer, with the gradient."""
     scores = targets.scores[first.entries[row]]
     score, of_velocity, of_point = scores[0], scores[1], scores[2]
-    inverse = F(1.0 / (options.latent_std * options.latent_std))
     weight, change = F(1.0) if options.sums_dimensions else F(1.0) / F(velocity.size), F(0.0)
     slope = F(2.0 * options.brownian_coef) * weight / F(first.points.shape[0])
     for i in range(velocity.size):
         reference = targets.reference_velocity[row, i]
         change += (velocity[i] - reference) * (velocity[i] - reference)
-        score_term = (of_point * first.points[row, i] - of_velocity * reference) * inverse
+        score_term = of_point * first.points[row, i] - of_velocity * reference
+        score_term /= targets.latent_std[i] * targets.latent_std[i]
         eta = score * velocity[i] - score_term
         sums[BROWNIAN] += weight * eta * eta
         if slope != F(0.0):  # eta may be infinite
