@@ -54,7 +54,7 @@ def draw_goal_counts(axes: Axes, trajectories: Trajectories) -> None:
     axes.set_xticks(places, [str(count) for count in report.counts])
     axes.tick_params(length=0, labelsize=7.5, labelcolor=INK, pad=2)
     axes.axhline(n / len(GOALS), color=GRAY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
-    axes.set(ylim=(0, 1.08 * max(n / len(GOALS), *report.counts)), yticks=[])
+    axes.set(ylim=(0, n), yticks=[])  # the same scale in every panel
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.spines["bottom"].set_color(PALE)
     axes.set_xlabel(
@@ -73,7 +73,12 @@ def goals_figure(runs: Mapping[str, Trajectories], n_columns: int = 3) -> Figure
     """
     n_columns = min(n_columns, len(runs))
     n_rows = -(-len(runs) // n_columns)
-    figure = Figure(figsize=(3.1 * n_columns, 4.05 * n_rows), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(3.1 * n_columns, 4.05 * n_rows + 0.3), dpi=DPI, layout="constrained")
+    figure.supxlabel(
+        "gray: at no goal. Bars: trajectories that end at each goal; dashed: all goals alike",
+        fontsize=8,
+        color=INK,
+    )
     panels = np.ravel(figure.subfigures(n_rows, n_columns, squeeze=False))
     for panel, (title, trajectories) in zip(panels, runs.items(), strict=False):
         _draw_panel(panel, title, trajectories)
