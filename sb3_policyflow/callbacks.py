@@ -227,8 +227,8 @@ def warn_of_deterministic_actions(drawn: ArrayLike, deterministic: ArrayLike, ad
     if high - low <= max(0.25 * max(abs(high), abs(low)), 3 * np.sqrt(sum(errors))):
         return False
     warnings.warn(
-        f"Deterministic actions return {low:.4g} and drawn ones {high:.4g}: the action without "
-        f"noise, at z = 0, may lie between several modes. To see what was learned, {advice}.",
+        f"Deterministic actions return {low:.4g} and drawn ones {high:.4g}: one action for "
+        f"each observation may be too few for this policy. To see what was learned, {advice}.",
         stacklevel=2,
     )
     return True

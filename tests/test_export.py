@@ -153,7 +153,7 @@ def test_a_chain_without_noise_is_the_record_of_its_means(tmp_path: Path) -> Non
     found = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     # Drawing the start in predict is for evaluation, and not what is exported.
-    model.policy.random_latents = True
+    model.policy.deterministic_action = "drawn"
     module = ActionModule(model.policy)
     assert th.equal(module(th.as_tensor(obs)), module(th.as_tensor(obs)))
 

@@ -21,7 +21,7 @@ from sb3_policyflow.export import load_model
 MODES = {
     "stochastic": "actions drawn as in training",
     "latent-only": "latents drawn, no other noise",
-    "deterministic": "z = 0, no noise",
+    "deterministic": "one action for each observation, no noise",
 }
 
 

@@ -11,7 +11,6 @@ from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -19,8 +18,16 @@ from sb3_policyflow.common.schedules import (
     parse_schedule,
     start_adaptive_learning_rate,
 )
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
-from sb3_policyflow.kernels import reason_kernels_are_off
+from sb3_policyflow.common.update import (
+    FlowUpdate,
+    Loss,
+    UpdateMetrics,
+    check_model,
+    check_step,
+    clip_gradients,
+    take_step,
+)
+from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
@@ -42,6 +49,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
+    :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
+        from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -50,6 +60,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
+    former_values: ClassVar[Mapping[str, Any]] = {"has_former_defaults": True}
+    has_former_defaults: bool = False
+    """Whether a file of version 0.1 was loaded: what it does not say, had other defaults."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
@@ -63,7 +76,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name in names.settable_options(cls.policy_base):
+        for name in {"random_latents", *names.settable_options(cls.policy_base)}:
             if not hasattr(cls, name):
                 setattr(cls, name, options.PolicyOption(name))
 
@@ -101,6 +114,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
+        n_critic_warmup: int = 0,
+        imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -114,7 +129,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
+        self.n_critic_warmup = n_critic_warmup
+        self.imitation_coef = imitation_coef
+        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
+        self.has_former_defaults = False  # an attribute of files
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
         self._adaptive_start: float | None = None
@@ -143,6 +162,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         options.read_loaded_options(self)
+        names.keep_former_defaults(self)
         options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
@@ -155,8 +175,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         if self.clip_range_vf is not None:
             self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
-        for check in self.model_checks:
-            check(self)
+        check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
@@ -204,6 +223,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
+    @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         self._update_learning_rate(self.policy.optimizer)
@@ -211,7 +231,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
-        clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
@@ -220,19 +239,11 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
             for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
-                features, critic_features = self.policy.actor_critic_features(batch.observations)
-                terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
                 advantages = self._normalized(batch.advantages, "minibatch")
-                policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
-                # Squared error of the values against the TD(lambda) returns
-                values = self.policy.values(critic_features).flatten()
-                value_loss = clipped_value_loss(
-                    values, batch.old_values, batch.returns, clip_range_vf
-                )
-                metrics.add_means({"value_loss": value_loss, **terms.metrics})
-                loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
-                kls.append(terms.kl.detach())
-                stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
+                # Lines 18 to 21: ratio, surrogate objective, regularizers, error of the values
+                loss, kl = update.loss(batch._replace(advantages=advantages), metrics)
+                kls.append(kl)
+                stop = self.target_kl is not None and kl.item() > 1.5 * self.target_kl
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
@@ -254,9 +265,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return advantages
 
-    def _optimize(
-        self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
-    ) -> None:
+    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
@@ -264,13 +273,13 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         for parameter in parameters:
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
-        th.autograd.backward(loss, inputs=trained)
+        loss.backward(inputs=trained)
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
-        self.policy.optimizer.step()
+        take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
 
-    def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+    def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):

@@ -2,15 +2,25 @@
 
 import inspect
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
+import torch as th
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_policyflow.hints import did_you_mean, either, nearest
 
-FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
+FORMER_VALUES: dict[tuple[str, object], str] = {
+    ("time_sampler", "starts"): "grid_without_end",
+    ("deterministic_action", True): "drawn",  # was random_latents
+    ("deterministic_action", False): "zero",
+}
 """Present values of options by option and former value."""
+
+FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
+"""Defaults of policies in version 0.1, where they are others now."""
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
@@ -40,6 +50,48 @@ NOT_CALLED = {
 
 NOT_CALLED_BY_TRAINING = ("evaluate_actions", "get_distribution")
 """Methods of SB3's policies that PPO trains with, and flow algorithms do not."""
+
+
+class FormerAttribute:
+    """An attribute under its former name, with former values, for those who set it later.
+
+    :param present: Its present name.
+    """
+
+    def __init__(self, present: str) -> None:
+        self._present = present
+
+    def __set_name__(self, owner: type[Any], name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: Any, owner: type[Any] | None = None) -> Any:
+        return self if holder is None else getattr(holder, self._present)
+
+    def __set__(self, holder: Any, value: object) -> None:
+        changed = with_present_names({self._name: value}, {self._name: self._present})
+        setattr(holder, self._present, changed[self._present])
+
+
+class WithoutLikelihood:
+    """SB3's methods of policies that make no sense without a likelihood of actions, refused."""
+
+    def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
+        """Refuse: SB3's distributions say how likely actions are."""
+        raise self._no_likelihood()
+
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> Any:  # noqa: ARG002
+        """Refuse: the likelihood of an action under a flow policy has no closed form."""
+        raise self._no_likelihood()
+
+    def reset_noise(self, n_envs: int = 1) -> None:  # noqa: ARG002
+        """Refuse: this is gSDE's noise."""
+        raise TypeError(f"{type(self).__name__} does not support gSDE, whose noise this resets.")
+
+    def _no_likelihood(self) -> TypeError:
+        return TypeError(
+            f"{type(self).__name__} has no closed-form likelihood of actions, which PPO needs: "
+            "make, load and train it with the flow algorithms of sb3_policyflow, which need none."
+        )
 
 
 def check_overridden_methods(policy_class: type[Any], base: type[Any]) -> None:
@@ -72,7 +124,25 @@ def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
 
 def settable_options(policy_class: type[Any]) -> set[str]:
     """Names of the options of a policy that are attributes of its algorithm too."""
-    return {"random_latents"} | {option.name for option in own_options(policy_class)}
+    return {"deterministic_action"} | {option.name for option in own_options(policy_class)}
+
+
+def keep_former_defaults(model: Any) -> None:
+    """Give the policy of a file of version 0.1 the defaults of that version.
+
+    :param model: An algorithm whose attributes have just been loaded, or set.
+    """
+    if not model.has_former_defaults:
+        return
+    model.has_former_defaults = False
+    kwargs = model.policy_kwargs or {}
+    given = with_present_names(kwargs, model.former_names, warn=False).keys() | model.policy_options
+    taken = policy_parameters(model.policy_class)
+    for name, value in FORMER_DEFAULTS.items():
+        # A class of the user's own may have a default of its own.
+        own, base = taken.get(name), policy_parameters(model.policy_base).get(name)
+        if name not in given and own and base and own.default == base.default:
+            model.policy_options[name] = value
 
 
 def policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
@@ -197,14 +267,11 @@ def with_present_names(
             {**(present.get(name) or {}), key: options[former]} if key else options[former]
         )
         _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
-    for name, former in _former_values(present):
-        present[name] = FORMER_VALUES[name, former]
-        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
+    for (name, value), replacement in FORMER_VALUES.items():
+        if present.get(name) == value:
+            present[name] = replacement
+            _warn_if(warn, f"{name}={value!r} is now {replacement!r}")
     return present
-
-
-def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
 
 
 def _warn_if(warn: bool, change: str) -> None:

@@ -28,6 +28,7 @@ from sb3_policyflow.common.schedules import (
     parse_schedule,
     positive_at_first,
 )
+from sb3_policyflow.common.update import check_cloned, check_model
 
 P = ParamSpec("P")
 
@@ -68,6 +69,8 @@ class FlowOptions(TypedDict, total=False):
     advantage_scope: str
     timeout_bootstrap: str
     allow_nan_observations: bool
+    n_critic_warmup: int
+    imitation_coef: Coefficient
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
@@ -86,11 +89,14 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "n_epochs": checks.at_least(1),
     "advantage_scope": checks.one_of(("minibatch", "rollout")),
     "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
+    "n_critic_warmup": checks.at_least(0),
+    "imitation_coef": parse_schedule,
 }
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
 
 FORMER_NAMES = {
     "_n_rollouts": "n_rollouts",
+    "random_latents": "deterministic_action",
     "lr_adaptation": "lr_adaptation_kwargs.interval",
     "lr_factor": "lr_adaptation_kwargs.factor",
     "lr_bounds": "lr_adaptation_kwargs.bounds",
@@ -281,9 +287,8 @@ def check_values(model: Any) -> None:
     :raises ValueError: With what to use instead.
     """
     checks.check_options(model)
-    checks.check_batch_size(
-        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
-    )
+    sizes = model.batch_size, model.n_steps, model.n_envs
+    checks.check_batch_size(*sizes, model.normalize_advantage)
     if model.desired_kl is not None:
         check_desired_kl(model.desired_kl, model.learning_rate)
 
@@ -295,9 +300,9 @@ def take_up_changes(model: Any) -> None:
     :raises ValueError: If a value cannot be used, or cannot change.
     """
     check_values(model)
+    check_cloned(model)
     note_changed_options(model)
-    for check in model.model_checks:
-        check(model)
+    check_model(model)
     model.rollout_buffer.gamma = model.gamma
     model.rollout_buffer.gae_lambda = model.gae_lambda
     model.read_learning_rate()

@@ -37,7 +37,8 @@ def export(
     :param path: The file, which ends in ".onnx" or ".pt2".
     :param normalize: The ``VecNormalize`` that the policy was trained with; by default that of the
         model's environment.
-    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise z = 0.
+    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise they are
+        those of the deterministic action.
     :param normalized_input: Whether the file takes observations that are normalized already.
     :raises ValueError: If ``path`` has another suffix, or the normalization that a model was
         trained with is missing.

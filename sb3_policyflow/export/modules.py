@@ -87,6 +87,8 @@ class ActionModule(nn.Module):
         super().__init__()
         self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
         self.policy.set_training_mode(False)
+        if self.policy.deterministic_action == "drawn":
+            self.policy.deterministic_action = "mode"
         _with_plain_mish(self.policy)
         wrapped = None if normalize is None else vars(normalize).get("venv")
         self.raw_space = space if wrapped is None else wrapped.observation_space
@@ -101,13 +103,14 @@ class ActionModule(nn.Module):
 
         :param observations: Observations of the environment, with images channels first: a tensor
             (n, ...), or a dictionary of tensors.
-        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
-            PolicyFlow's latents have standard deviation ``latent_std``.
+        :param latents: z, where the flow starts, shape (n, action_dim); those of the deterministic
+            action if not given. Drawn ones are normal with standard deviation
+            ``policy.latent_scale``.
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
         if latents is None:
-            latents = features.new_zeros(features.shape[0], self.policy.action_dim)
+            latents = self.policy.draw_latents(features, deterministic=True)
         actions = self.policy.transport(latents, features).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)

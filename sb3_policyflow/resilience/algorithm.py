@@ -1,12 +1,10 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
-import functools
-import inspect
 import io
 import pathlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -16,7 +14,6 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_policyflow.hints import did_you_mean
 from sb3_policyflow.resilience.collection import (
     Infos,
     PendingBonus,
@@ -27,43 +24,16 @@ from sb3_policyflow.resilience.collection import (
 )
 from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
-from sb3_policyflow.resilience.saving import Observed, RandomStates, ResumeState
+from sb3_policyflow.resilience.saving import (
+    Observed,
+    RandomStates,
+    ResumeState,
+    check_attributes,
+    takes_former_path,
+)
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def check_attributes(algorithm: type[Any], given: Collection[str], saved: Collection[str]) -> None:
-    """Refuse attributes for ``load`` to change that no model has.
-
-    :param algorithm: The class of the model.
-    :param given: Their names.
-    :param saved: Names of the attributes that are in the file.
-    :raises TypeError: With the nearest names.
-    """
-    arguments = inspect.signature(algorithm).parameters.keys() - {"policy", "env"}
-    known = {*arguments, *algorithm.former_names, *saved}
-    for name in given:
-        if name not in known and not hasattr(algorithm, name):
-            meant = did_you_mean(name, known, "the file has no such attribute.")
-            raise TypeError(f"{algorithm.__name__}.load has no {name!r} to change: {meant}")
-
-
-def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
-    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
-
-    @functools.wraps(load)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
-        cls: Any = args[0]
-        is_positional = len(args) > 1 and "path" in kwargs
-        present = cls.former_names.get("path") if is_positional else None
-        if present is not None:
-            kwargs[present] = kwargs.pop("path")
-        return load(*args, **kwargs)
-
-    return wrapped
 
 
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
@@ -87,6 +57,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
+    former_values: ClassVar[Mapping[str, Any]] = {}
+    """Values of attributes that files of earlier versions do not have."""
     unsaved: ClassVar[tuple[str, ...]] = (
         "_callback",
         "_step_checks",
@@ -233,7 +205,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), *self.unsaved]
 
     @classmethod
-    @_takes_former_path
+    @takes_former_path
     def load(
         cls: type[SelfResilient],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -268,7 +240,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         """
         with opened(path, suffix="zip") as file:
             check_archive(file, path, members=("data", "policy.pth"))
-            check_attributes(cls, kwargs, saved_attributes(file))
+            saved = saved_attributes(file)
+            check_attributes(cls, kwargs, saved)
+            missing = {k: v for k, v in cls.former_values.items() if k not in saved}
+            kwargs = {**missing, **kwargs}
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )

@@ -313,7 +313,7 @@ def test_evaluation_leaves_the_training_alone() -> None:
     again = [evaluate(model, evaluation, mode, 2)["mean_return"] for mode in modes(model)]
     assert found == again
     assert found[0] == found[1] != found[2]  # no noise but the latents'
-    assert not model.policy.random_latents
+    assert model.policy.deterministic_action == "mode"
     np.testing.assert_array_equal(env.obs_rms.mean, mean)  # type: ignore[union-attr]
     np.testing.assert_array_equal(evaluation.obs_rms.mean, mean)  # type: ignore[union-attr]
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # type: ignore[index]

@@ -105,7 +105,7 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"clip_range_vf": -0.2}, r"clip_range_vf must not be negative"),
         (
             {"policy_kwargs": {"initialization": "he"}},
-            r"initialization must be one of 'glorot', .*, got 'he'",
+            r"initialization must be one of 'orthogonal', .*, got 'he'",
         ),
         ({"policy_kwargs": {"embedding_dim": 0}}, r"embedding_dim must be at least 1"),
         (

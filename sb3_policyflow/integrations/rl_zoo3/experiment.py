@@ -23,14 +23,17 @@ from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.callbacks import warn_of_deterministic_actions
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
 from sb3_policyflow.hints import did_you_mean
+from sb3_policyflow.integrations.rl_zoo3.cloning import CloningBeforeTraining
 from sb3_policyflow.integrations.rl_zoo3.samplers import TASK, Task
 
 ZOO_KEYS = (
     "callback",
+    "demonstrations",
     "deterministic_eval",
     "env_kwargs",
     "env_wrapper",
     "frame_stack",
+    "imitation_kwargs",
     "monitor_kwargs",
     "n_envs",
     "n_timesteps",
@@ -49,6 +52,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
     """
     env_id = manager.env_name.gym_id
     is_own_algorithm = manager.algo in own_algorithms
+    CloningBeforeTraining(manager)
     if not config_given:
         manager.config = choose_config(manager.algo, env_id, manager.config)
     # Any other class than DummyVecEnv has been chosen explicitly.
@@ -120,8 +124,11 @@ def with_task(manager: Any) -> Callable[..., float]:
 
     @functools.wraps(objective)
     def run(trial: Any) -> float:
-        TASK.set(task)
-        return float(objective(trial))
+        before = TASK.set(task)
+        try:
+            return float(objective(trial))
+        finally:
+            TASK.reset(before)
 
     manager._preprocess_action_noise = note_task
     return run
