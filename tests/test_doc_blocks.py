@@ -128,23 +128,24 @@ def parse(words: list[str]) -> None:
         with pytest.raises(SystemExit, match="There is no file"):
             main(arguments)
     else:
-        assert module in ("rl_zoo3.train", "rl_zoo3.enjoy", "rl_zoo3.record_video"), words
-        options = zoo_options(module)
+        ours = "sb3_policyflow.imitation", "sb3_policyflow.integrations.isaaclab"
+        assert module.startswith(("rl_zoo3.", *ours)), words
+        options = options_of(module)
         for word in arguments:  # argparse takes an option by its beginning
             if re.match(r"--?[a-z]", word):
                 assert any(option.startswith(word) for option in options), words
 
 
-def zoo_options(module: str) -> set[str]:
-    """The options that a command of rl_zoo3 has, by its help."""
-    if module not in ZOO_OPTIONS:
+def options_of(module: str) -> set[str]:
+    """The options that a command has, by its help."""
+    if module not in OPTIONS:
         command = [sys.executable, "-m", module, "--help"]
         text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        ZOO_OPTIONS[module] = set(re.findall(r"(?<![\w-])--?[a-z][\w-]*", text))
-    return ZOO_OPTIONS[module]
+        OPTIONS[module] = set(re.findall(r"(?<![\w-])--?[a-z][\w-]*", text))
+    return OPTIONS[module]
 
 
-ZOO_OPTIONS: dict[str, set[str]] = {}
+OPTIONS: dict[str, set[str]] = {}
 
 
 @pytest.mark.slow
