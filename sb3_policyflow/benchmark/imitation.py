@@ -132,8 +132,8 @@ def _row(name: str, results: Sequence[Result]) -> list[str]:
         for is_trained in (False, True)
     ]
     for quantity, digits in QUANTITIES.items():
-        for stage in stages:
-            row.append(over_seeds([float(each[quantity]) for each in stage]).format(digits))
+        values = [[float(each[quantity]) for each in stage] for stage in stages]
+        row += [over_seeds(of_stage).format(digits) for of_stage in values]
     return row
 
 
