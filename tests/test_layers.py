@@ -10,18 +10,37 @@ import sb3_policyflow
 ROOT = Path(sb3_policyflow.__file__).parent
 ALGORITHMS = ("policyflow", "fpo", "dppo")
 BELOW: dict[str, set[str]] = {
-    "envs": set(),
+    "hints": set(),
+    "envs": {"hints"},
     "flows": set(),
-    "resilience": set(),
+    "resilience": {"hints"},
     "kernels": {"flows"},
-    "common": {"flows", "kernels", "resilience"},
-    **{name: {"common", "flows"} for name in ALGORITHMS},
+    "common": {"flows", "hints", "kernels", "resilience"},
+    **{name: {"common", "flows", "kernels"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
-    "export": {"common", "algorithms"},
+    "export": {"common", "algorithms", "hints", "resilience"},
     "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
-    "integrations": {"algorithms", "envs", "imitation", "policyflow", "resilience"},
-    "benchmark": {"common", "envs", "imitation", "integrations", "resilience", "__init__"},
+    "integrations": {
+        "algorithms",
+        "callbacks",
+        "envs",
+        "hints",
+        "imitation",
+        "policyflow",
+        "resilience",
+    },
+    "benchmark": {
+        "callbacks",
+        "common",
+        "envs",
+        "export",
+        "hints",
+        "imitation",
+        "integrations",
+        "resilience",
+        "__init__",
+    },
 }
 """What each folder or module of the package may import."""
 

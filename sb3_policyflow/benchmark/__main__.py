@@ -15,6 +15,7 @@ COMMANDS = {
     "pointmaze": ("pointmaze", "the paper's exploration maps"),
     "imitation": ("imitation", "MultiGoal from demonstrations, cloned and trained further"),
     "playground": ("playground", "four algorithms on tasks of MuJoCo Playground"),
+    "card": ("card", "evaluate a model and write its Hugging Face model card"),
     "speed": ("speed.training", "time PolicyFlow and PPO side by side"),
     "environments": ("speed.environments", "time environments on their own"),
 }

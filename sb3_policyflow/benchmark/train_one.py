@@ -19,9 +19,20 @@ from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC, EvaluationCa
 from sb3_policyflow.benchmark.measure.goals import goal_report, sample_trajectories
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.measure.visits import VisitCounter
-from sb3_policyflow.benchmark.results import Result, Run
+from sb3_policyflow.benchmark.results import PROGRESS, Result, Run
 
 N_EVALUATION_ENVS = 10
+
+
+class ProgressCallback(BaseCallback):
+    """Writes to the log how far the training is, for the bar of the command that started it."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        share = self.num_timesteps / self.model._total_timesteps
+        print(f"{PROGRESS}{min(share, 1.0):.0%}", flush=True)
 
 
 def train_one(run: Run, folder: Path) -> Result:
@@ -41,7 +52,7 @@ def train_one(run: Run, folder: Path) -> Result:
         evaluations = EvaluationCallback(env, due, run.n_episodes)
         # Only these need the extra ``robotics``.
         counters = [VisitCounter()] if run.keep_visits else []
-        callbacks = [*manager.callbacks, *counters]
+        callbacks = [*manager.callbacks, ProgressCallback(), *counters]
         summary: dict[str, Any] = {
             "hyperparams": {key: str(value) for key, value in hyperparams.items()}
         }

@@ -2,16 +2,15 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
-from copy import deepcopy
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
-from sb3_policyflow.common.losses import SURROGATES
-from sb3_policyflow.flows import MatchingSamples
-from sb3_policyflow.kernels import clip_gradients_in_place
+from sb3_policyflow.common.losses import SURROGATES, clipped_value_loss
+from sb3_policyflow.common.pull import ImitationPull
+from sb3_policyflow.kernels import clip_gradients_in_place, step_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -28,6 +27,32 @@ class PolicyTerms(NamedTuple):
     metrics: dict[str, th.Tensor]
 
 
+class Loss(Protocol):
+    """What a step of the optimizer needs of a loss: a tensor is one."""
+
+    def item(self) -> float:
+        """Its value."""
+
+    def backward(self, *, inputs: Any = None) -> None:
+        """Add its gradients to those of the parameters; of ``inputs`` only, if they are given."""
+
+
+class CompiledTerms(NamedTuple):
+    """A minibatch's loss and divergence, see :class:`PolicyTerms`, and what is to be logged.
+
+    Means over the minibatches are logged of ``means``, and the greatest of ``maxima``.
+    """
+
+    loss: Loss
+    kl: th.Tensor
+    means: dict[str, float]
+    maxima: dict[str, float]
+
+
+CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], CompiledTerms | None]
+"""Takes a minibatch, and the features of actor and critic; None where kernels cannot work."""
+
+
 class FlowUpdate(ABC):
     """An algorithm's part of the update of one rollout.
 
@@ -37,7 +62,8 @@ class FlowUpdate(ABC):
     ``clip_range`` is epsilon, one number or of a shape that broadcasts with a log ratio (n, ...).
     Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
     ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
-    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout.
+    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout. If there is a
+    ``compiled_loss``, it takes the place of the formulas in :meth:`loss` where it can.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
@@ -45,15 +71,21 @@ class FlowUpdate(ABC):
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
+        self.policy: Any = algorithm.policy
+        self.vf_coef: float = algorithm.vf_coef
+        bounds_values = algorithm.clip_range_vf is not None
+        self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
+        self.compiled_loss: CompiledLoss | None = None
         self.batch_size: int = algorithm.batch_size
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
+        self.imitation_coef: float = algorithm.value_of("imitation_coef")
         self.pull: ImitationPull | None = None
-        if (coef := algorithm.value_of("imitation_coef")) > 0:
-            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)
+        if self.imitation_coef > 0:
+            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters)
 
     @abstractmethod
     def draw(self) -> tuple[th.Tensor, ...]:
@@ -67,13 +99,34 @@ class FlowUpdate(ABC):
         :param features: The actor's features, shape (n, features_dim).
         """
 
-    def all_terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
-        """The terms of the policy loss, with the pull towards a cloned policy if there is one.
+    def loss(
+        self, batch: FlowRolloutBufferSamples, metrics: "UpdateMetrics"
+    ) -> tuple[Loss, th.Tensor]:
+        """The loss of a minibatch (paper, algorithm 1, lines 18 to 21).
 
-        Takes the arguments of :meth:`terms`.
+        :param batch: n samples, with what was drawn for them.
+        :param metrics: Takes what is to be logged.
+        :return: The loss, and the divergence from the reference policy, without dimensions.
         """
-        terms = self.terms(batch, features)
-        return terms if self.pull is None else self.pull.added_to(terms, batch, features)
+        features, critic_features = self.policy.actor_critic_features(batch.observations)
+        if self.compiled_loss is not None and self.pull is None:
+            compiled = self.compiled_loss(batch, features, critic_features)
+            if compiled is not None:
+                metrics.add_means(compiled.means)
+                metrics.add_maxima(compiled.maxima)
+                return compiled.loss, compiled.kl
+        terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
+        regularizer = terms.regularizer
+        if self.pull is not None:
+            imitation_loss = self.pull.loss(batch, features)
+            regularizer = regularizer + self.imitation_coef * imitation_loss
+            metrics.add_means({"imitation_loss": imitation_loss})
+        policy_loss = self.surrogate_loss(terms.log_ratio, batch.advantages, metrics)  # line 19
+        # Squared error of the values against the TD(lambda) returns
+        values = self.policy.values(critic_features).flatten()
+        value_loss = clipped_value_loss(values, batch.old_values, batch.returns, self.clip_range_vf)
+        metrics.add_means({"value_loss": value_loss, **terms.metrics})
+        return policy_loss + regularizer + self.vf_coef * value_loss, terms.kl.detach()
 
     def surrogate_loss(
         self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
@@ -105,57 +158,18 @@ class FlowUpdate(ABC):
         return loss
 
 
-def matched_outputs(policy: Any, drawn: MatchingSamples, features: th.Tensor) -> th.Tensor:
-    """What a policy's network says at the points of flow matching, shape (n, action_dim).
+def check_warmup(model: Any) -> None:
+    """Refuse to train a critic alone that cannot be told from the actor.
 
-    :param policy: The policy.
-    :param drawn: The points.
-    :param features: The actor's features, shape (n, features_dim).
+    :param model: An algorithm.
+    :raises TypeError: If the policy has networks of the user's own without a ``value_net``.
     """
-    # Behind its own, DPPO has features for networks that are not trained.
-    features = features[:, : policy.mlp_extractor.latent_dim_pi]
-    outputs: th.Tensor = policy.velocity(drawn.points, drawn.times, features)
-    return outputs
-
-
-class ImitationPull:
-    """Pulls a policy towards the one that was cloned from demonstrations.
-
-    coef E ||g (v - v_cloned)||^2    at points on the way from drawn latents to the actions taken
-
-    v is the velocity, and g = 1; of DPPO the network's output, which g turns into what the mean of
-    the next step changes by.
-
-    :param policy: The policy that learns.
-    :param parameters: Its parameters when it had been cloned, by name.
-    :param coef: Weight of the pull at the present progress.
-    """
-
-    def __init__(self, policy: Any, parameters: Mapping[str, Any], coef: float) -> None:
-        self._policy, self._coef = policy, coef
-        self._cloned = deepcopy(policy).requires_grad_(False)
-        tensors = {name: th.as_tensor(values) for name, values in parameters.items()}
-        self._cloned.load_state_dict(tensors, strict=False)
-        self._cloned.set_training_mode(False)
-
-    def added_to(
-        self, terms: PolicyTerms, batch: FlowRolloutBufferSamples, features: th.Tensor
-    ) -> PolicyTerms:
-        """The terms of a minibatch with the pull among them.
-
-        :param terms: Those of the algorithm.
-        :param batch: The minibatch of n samples.
-        :param features: The actor's features, shape (n, features_dim).
-        """
-        drawn = self._policy.draw_matching(batch.actions.flatten(1))
-        with th.no_grad():
-            cloned_features = self._cloned.actor_features(batch.observations)
-            cloned = matched_outputs(self._cloned, drawn, cloned_features)
-        change = matched_outputs(self._policy, drawn, features) - cloned
-        loss = (drawn.gains.unsqueeze(-1) * change).square().sum(dim=-1).mean()
-        return terms._replace(
-            regularizer=terms.regularizer + self._coef * loss,
-            metrics={**terms.metrics, "imitation_loss": loss},
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
         )
 
 
@@ -171,33 +185,40 @@ class UpdateMetrics:
     """
 
     def __init__(self) -> None:
-        self._to_average: dict[str, list[th.Tensor]] = {}
-        self._to_maximize: dict[str, list[th.Tensor]] = {}
+        self._to_average: dict[str, list[Any]] = {}
+        self._to_maximize: dict[str, list[Any]] = {}
 
-    def add_means(self, metrics: Mapping[str, th.Tensor]) -> None:
-        """Add metrics of one minibatch, tensors without dimensions, that are averaged."""
+    def add_means(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
+        """Add metrics of one minibatch, tensors without dimensions or numbers, to be averaged."""
         for name, value in metrics.items():
             self._append(self._to_average.setdefault(name, []), value)
 
-    def add_maxima(self, metrics: Mapping[str, th.Tensor]) -> None:
+    def add_maxima(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
         """Add metrics of one minibatch of which the greatest counts."""
         for name, value in metrics.items():
             self._append(self._to_maximize.setdefault(name, []), value)
 
     @staticmethod
-    def _append(values: list[th.Tensor], value: th.Tensor) -> None:
-        values.append(value.detach())
-        if len(values) == 32:
+    def _append(values: list[Any], value: th.Tensor | float) -> None:
+        values.append(value.detach() if isinstance(value, th.Tensor) else value)
+        if len(values) == 32 and isinstance(value, th.Tensor):
             # Many small tensors would keep the memory between them from being used again.
-            values[:] = [th.hstack(values)]
+            values[:] = [_joined(values)]
 
     def summary(self) -> dict[str, float]:
         """Each metric over all minibatches."""
-        reduced = {name: th.hstack(values).mean() for name, values in self._to_average.items()}
-        reduced |= {name: th.hstack(values).max() for name, values in self._to_maximize.items()}
+        reduced = {name: _joined(values).mean() for name, values in self._to_average.items()}
+        reduced |= {name: _joined(values).max() for name, values in self._to_maximize.items()}
         if not reduced:
             return {}
         return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))
+
+
+def _joined(values: list[Any]) -> th.Tensor:
+    """Tensors and numbers as one tensor."""
+    numbers = [value for value in values if not isinstance(value, th.Tensor)]
+    tensors = [value for value in values if isinstance(value, th.Tensor)]
+    return th.hstack([*tensors, th.tensor(numbers)] if numbers else tensors)
 
 
 def make_optimizer(
@@ -246,6 +267,12 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)
     return norm
+
+
+def take_step(optimizer: th.optim.Optimizer) -> None:
+    """Take a step of an optimizer, in one call of a kernel if it is plain Adam on a CPU."""
+    if not step_in_place(optimizer):
+        optimizer.step()
 
 
 def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> None:

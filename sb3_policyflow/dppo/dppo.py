@@ -34,9 +34,10 @@ class DPPOUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: DPPOPolicy
+
     def __init__(self, algorithm: "DPPO", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
-        self.policy = algorithm.policy
         self.log_prob_clamp = algorithm.log_prob_clamp
         self.log_prob_reduction = algorithm.log_prob_reduction
         self.entropy_bonus = EntropyBonus(

@@ -16,6 +16,7 @@ from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.flows import MatchingSamples
+from sb3_policyflow.flows.bounds import SHORTEST_MEANINGLESS
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
 
 
@@ -43,9 +44,6 @@ class DPPORecord(NamedTuple):
     means: th.Tensor
 
 
-SHORTEST_MEANINGLESS = 200.0
-"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
-others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
 ADVICE = (
     "use process='flow', which does not scale, or give the environment bounds that mean something "
     "(gymnasium.wrappers.TransformAction)"
@@ -172,6 +170,10 @@ class DPPOPolicy(FlowPolicy):
                 self.base_mlp_extractor = deepcopy(self.mlp_extractor).requires_grad_(False)
 
     @property
+    def latent_scale(self) -> float:
+        return 1.0
+
+    @property
     def n_evaluations_per_action(self) -> int:
         return self.n_denoising_steps
 
@@ -255,7 +257,7 @@ class DPPOPolicy(FlowPolicy):
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, DPPORecord]:
-        """Draw actions; the deterministic one starts at 0 and each step goes to its mean."""
+        """Draw actions; in deterministic ones each step goes to its mean."""
         latents = self.draw_latents(features, deterministic)
         points, means = self._chain(latents, features, is_noisy=not deterministic)
         record = DPPORecord(

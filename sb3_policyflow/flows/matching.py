@@ -27,7 +27,7 @@ class MatchingSamples(NamedTuple):
 
 
 def draw_matching(
-    interpolant: Interpolant, endpoints: th.Tensor, latent_std: float = 1.0
+    interpolant: Interpolant, endpoints: th.Tensor, latent_std: float | th.Tensor = 1.0
 ) -> MatchingSamples:
     """Draw latents and times, and what conditional flow matching makes of them.
 
@@ -45,7 +45,7 @@ def draw_matching(
 
     :param interpolant: The path from latents to end points.
     :param endpoints: phi, shape (n, dim).
-    :param latent_std: Standard deviation of the latents.
+    :param latent_std: Standard deviation of the latents, one or for each dimension (dim,).
     """
     latents = latent_std * th.randn_like(endpoints)
     times = th.rand(len(endpoints), device=endpoints.device, dtype=endpoints.dtype)

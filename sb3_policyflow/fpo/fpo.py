@@ -48,9 +48,11 @@ class FPOUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: FPOPolicy
+
     def __init__(self, algorithm: "FPO", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
-        self.policy = policy = algorithm.policy
+        policy = algorithm.policy
         self.algorithm = algorithm
         self.entropy_bonus = EntropyBonus(
             algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states

@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.common.update import matched_outputs
+from sb3_policyflow.common.pull import matched_outputs
 from sb3_policyflow.flows import MatchingSamples
 from sb3_policyflow.policyflow import PolicyFlowPolicy
 

@@ -1,11 +1,10 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
-import functools
 import io
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -23,29 +22,18 @@ from sb3_policyflow.resilience.collection import (
     terminal_observations,
     time_limits,
 )
-from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
+from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
-from sb3_policyflow.resilience.saving import RandomStates, ResumeState
+from sb3_policyflow.resilience.saving import (
+    Observed,
+    RandomStates,
+    ResumeState,
+    check_attributes,
+    takes_former_path,
+)
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
-    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
-
-    @functools.wraps(load)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
-        cls: Any = args[0]
-        is_positional = len(args) > 1 and "path" in kwargs
-        present = cls.former_names.get("path") if is_positional else None
-        if present is not None:
-            kwargs[present] = kwargs.pop("path")
-        return load(*args, **kwargs)
-
-    return wrapped
 
 
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
@@ -69,7 +57,14 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
-    unsaved: ClassVar[tuple[str, ...]] = ("_callback", "_step_checks", "_saved_random_states")
+    former_values: ClassVar[Mapping[str, Any]] = {}
+    """Values of attributes that files of earlier versions do not have."""
+    unsaved: ClassVar[tuple[str, ...]] = (
+        "_callback",
+        "_step_checks",
+        "_saved_random_states",
+        "_saved_observed",
+    )
     """Attributes that no file has."""
 
     _callback: BaseCallback | None = None
@@ -77,6 +72,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
+
+    _saved_observed: Observed | None = None
+    """What a file says of the observations in the training that it is from."""
 
     # Collecting rollouts
 
@@ -192,6 +190,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         self.resume_state = ResumeState(
             random_states=self._saved_random_states or RandomStates.now(self.device),
             normalized_returns=None if normalize is None else normalize.returns.copy(),
+            observed=self.observed(),
         )
         try:
             if isinstance(path, (str, pathlib.Path)):
@@ -206,7 +205,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), *self.unsaved]
 
     @classmethod
-    @_takes_former_path
+    @takes_former_path
     def load(
         cls: type[SelfResilient],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -237,9 +236,14 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             sets them, as SB3 does. So does a ``seed`` among ``kwargs``.
         :param kwargs: Attributes to change.
         :raises ValueError: If the file is no saved model, or the environment does not fit it.
+        :raises TypeError: If there is no attribute of a name among ``kwargs``.
         """
         with opened(path, suffix="zip") as file:
             check_archive(file, path, members=("data", "policy.pth"))
+            saved = saved_attributes(file)
+            check_attributes(cls, kwargs, saved)
+            missing = {k: v for k, v in cls.former_values.items() if k not in saved}
+            kwargs = {**missing, **kwargs}
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
@@ -247,9 +251,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         state: ResumeState | None = model.__dict__.pop("resume_state", None)
         if not force_reset:
             model._continue_episodes(state)
+        model._saved_observed = None if state is None else state.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
+
+    def observed(self) -> Observed:
+        """What the policy observed in training: whether it was normalized, and the space before."""
+        normalize = self.get_vec_normalize_env()
+        if normalize is not None:
+            return Observed(normalize.norm_obs, normalize.venv.observation_space)
+        return self._saved_observed or Observed(False, self.observation_space)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Those that ``load`` has found are forgotten.

@@ -339,12 +339,12 @@ def test_options_that_do_not_go_together() -> None:
 
 
 def test_options_changed_to_and_fro(tmp_path: Path) -> None:
-    model = new(PolicyFlow, policy_kwargs={"random_latents": True, "n_flow_steps": 5})
-    for n_flow_steps, random_latents in ((4, False), (5, True), (6, False)):
-        model.n_flow_steps, model.random_latents = n_flow_steps, random_latents
+    model = new(PolicyFlow, policy_kwargs={"deterministic_action": "drawn", "n_flow_steps": 5})
+    for n_flow_steps, kind in ((4, "zero"), (5, "drawn"), (6, "mode")):
+        model.n_flow_steps, model.deterministic_action = n_flow_steps, kind
         model.learn(32).save(tmp_path / "model")
         loaded = PolicyFlow.load(tmp_path / "model").policy
-        assert (loaded.n_flow_steps, loaded.random_latents) == (n_flow_steps, random_latents)
+        assert (loaded.n_flow_steps, loaded.deterministic_action) == (n_flow_steps, kind)
 
 
 def test_former_names_do_not_come_back(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ networks = st.fixed_dictionaries(
         "net_arch": layers | st.fixed_dictionaries({}, optional={"pi": layers, "vf": layers}),
         "activation_fn": st.sampled_from([th.nn.Mish, th.nn.ELU, th.nn.ReLU]),
         "share_features_extractor": st.booleans(),
-        "initialization": st.sampled_from(["glorot", "glorot_zero_output", "zero"]),
+        "initialization": st.sampled_from(["orthogonal", "glorot", "glorot_zero_output", "zero"]),
         "frequencies": st.integers(1, 3) | st.just([1.0, 2.0]),
     },
 )
