@@ -20,7 +20,6 @@ BELOW: dict[str, set[str]] = {
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
     "export": {"common", "algorithms", "hints", "resilience"},
-    "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
     "integrations": {
         "algorithms",
         "callbacks",
@@ -30,6 +29,7 @@ BELOW: dict[str, set[str]] = {
         "policyflow",
         "resilience",
     },
+    "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
     "benchmark": {
         "callbacks",
         "common",

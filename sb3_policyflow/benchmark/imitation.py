@@ -132,8 +132,9 @@ def _row(name: str, results: Sequence[Result]) -> list[str]:
         for is_trained in (False, True)
     ]
     for quantity, digits in QUANTITIES.items():
-        values = [[float(each[quantity]) for each in stage] for stage in stages]
-        row += [over_seeds(of_stage).format(digits) for of_stage in values]
+        for stage in stages:
+            values = [float(each[quantity]) for each in stage]
+            row.append(over_seeds(values).format(digits))
     return row
 
 

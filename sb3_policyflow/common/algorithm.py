@@ -22,6 +22,7 @@ from sb3_policyflow.common.update import (
     FlowUpdate,
     Loss,
     UpdateMetrics,
+    check_model,
     check_step,
     check_warmup,
     clip_gradients,
@@ -175,8 +176,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         if self.clip_range_vf is not None:
             self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
-        for check in (check_warmup, *self.model_checks):
-            check(self)
+        check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)

@@ -29,7 +29,7 @@ from sb3_policyflow.common.schedules import (
     parse_schedule,
     positive_at_first,
 )
-from sb3_policyflow.common.update import check_warmup
+from sb3_policyflow.common.update import check_cloned, check_model
 
 P = ParamSpec("P")
 
@@ -301,9 +301,9 @@ def take_up_changes(model: Any) -> None:
     :raises ValueError: If a value cannot be used, or cannot change.
     """
     check_values(model)
+    check_cloned(model)
     note_changed_options(model)
-    for check in (check_warmup, check_cloned, *model.model_checks):
-        check(model)
+    check_model(model)
     model.rollout_buffer.gamma = model.gamma
     model.rollout_buffer.gae_lambda = model.gae_lambda
     model.read_learning_rate()

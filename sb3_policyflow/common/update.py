@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
-from sb3_policyflow.common.losses import SURROGATES, clipped_value_loss
-from sb3_policyflow.common.pull import ImitationPull
+from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
 from sb3_policyflow.kernels import clip_gradients_in_place, step_in_place
 
 
@@ -116,17 +115,18 @@ class FlowUpdate(ABC):
                 metrics.add_maxima(compiled.maxima)
                 return compiled.loss, compiled.kl
         terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
-        regularizer = terms.regularizer
         if self.pull is not None:
-            imitation_loss = self.pull.loss(batch, features)
-            regularizer = regularizer + self.imitation_coef * imitation_loss
-            metrics.add_means({"imitation_loss": imitation_loss})
+            pull = self.pull.loss(batch, features)
+            terms = terms._replace(
+                regularizer=terms.regularizer + self.pull.coef * pull,
+                metrics={**terms.metrics, "imitation_loss": pull},
+            )
         policy_loss = self.surrogate_loss(terms.log_ratio, batch.advantages, metrics)  # line 19
         # Squared error of the values against the TD(lambda) returns
         values = self.policy.values(critic_features).flatten()
         value_loss = clipped_value_loss(values, batch.old_values, batch.returns, self.clip_range_vf)
         metrics.add_means({"value_loss": value_loss, **terms.metrics})
-        return policy_loss + regularizer + self.vf_coef * value_loss, terms.kl.detach()
+        return policy_loss + terms.regularizer + self.vf_coef * value_loss, terms.kl.detach()
 
     def surrogate_loss(
         self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
@@ -156,21 +156,6 @@ class FlowUpdate(ABC):
             }
         )
         return loss
-
-
-def check_warmup(model: Any) -> None:
-    """Refuse to train a critic alone that cannot be told from the actor.
-
-    :param model: An algorithm.
-    :raises TypeError: If the policy has networks of the user's own without a ``value_net``.
-    """
-    networks = model.policy.mlp_extractor
-    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
-        raise TypeError(
-            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
-            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
-            "stable_baselines3.common.torch_layers.MlpExtractor."
-        )
 
 
 class UpdateMetrics:
@@ -218,7 +203,9 @@ def _joined(values: list[Any]) -> th.Tensor:
     """Tensors and numbers as one tensor."""
     numbers = [value for value in values if not isinstance(value, th.Tensor)]
     tensors = [value for value in values if isinstance(value, th.Tensor)]
-    return th.hstack([*tensors, th.tensor(numbers)] if numbers else tensors)
+    if numbers:
+        tensors.append(th.tensor(numbers, dtype=th.float32, device="cpu"))
+    return th.hstack(tensors)
 
 
 def make_optimizer(
@@ -291,3 +278,33 @@ def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> Non
         f"The {what} is not finite (loss {loss}, {num_timesteps} timesteps). The parameters are "
         f"those of the last good step and can be saved: lower the learning rate{advice}."
     )
+
+
+def check_model(model: Any) -> None:
+    """Refuse options that do not go together with each other or with the policy that was made.
+
+    :param model: An algorithm that has its policy.
+    :raises TypeError: If a critic is to be trained alone that cannot be told from the actor.
+    """
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
+        )
+    for check in model.model_checks:
+        check(model)
+
+
+def check_cloned(model: Any) -> None:
+    """Refuse a pull towards a policy that does not exist.
+
+    :raises ValueError: If the model was not cloned from demonstrations.
+    """
+    if model.imitation_coef != 0 and model.cloned_parameters is None:
+        raise ValueError(
+            f"imitation_coef={model.imitation_coef!r} pulls towards a policy that was cloned from "
+            "demonstrations, and this model was not: call sb3_policyflow.imitation.clone first, or "
+            "leave it out."
+        )

@@ -45,7 +45,7 @@ def draw_matching(
 
     :param interpolant: The path from latents to end points.
     :param endpoints: phi, shape (n, dim).
-    :param latent_std: Standard deviation of the latents, one or for each dimension (dim,).
+    :param latent_std: Standard deviation of the latents: a number, or one for each dimension.
     """
     latents = latent_std * th.randn_like(endpoints)
     times = th.rand(len(endpoints), device=endpoints.device, dtype=endpoints.dtype)

@@ -6,8 +6,8 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_policyflow.common.losses import matched_outputs
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.common.pull import matched_outputs
 from sb3_policyflow.flows import MatchingSamples
 from sb3_policyflow.policyflow import PolicyFlowPolicy
 

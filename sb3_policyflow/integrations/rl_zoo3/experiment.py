@@ -124,8 +124,11 @@ def with_task(manager: Any) -> Callable[..., float]:
 
     @functools.wraps(objective)
     def run(trial: Any) -> float:
-        TASK.set(task)
-        return float(objective(trial))
+        before = TASK.set(task)
+        try:
+            return float(objective(trial))
+        finally:
+            TASK.reset(before)
 
     manager._preprocess_action_noise = note_task
     return run
