@@ -24,7 +24,6 @@ from sb3_policyflow.common.update import (
     UpdateMetrics,
     check_model,
     check_step,
-    check_warmup,
     clip_gradients,
     take_step,
 )

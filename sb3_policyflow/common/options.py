@@ -21,7 +21,6 @@ from sb3_policyflow.common.names import (
     unknown_argument,
     with_present_names,
 )
-from sb3_policyflow.common.pull import check_cloned
 from sb3_policyflow.common.schedules import (
     Coefficient,
     check_desired_kl,

@@ -81,10 +81,9 @@ class FlowUpdate(ABC):
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
-        self.imitation_coef: float = algorithm.value_of("imitation_coef")
         self.pull: ImitationPull | None = None
-        if self.imitation_coef > 0:
-            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters)
+        if (coef := algorithm.value_of("imitation_coef")) > 0:
+            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)
 
     @abstractmethod
     def draw(self) -> tuple[th.Tensor, ...]:
