@@ -20,11 +20,11 @@ from sb3_policyflow.common.schedules import (
     start_adaptive_learning_rate,
 )
 from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
+from sb3_policyflow.distributed.algorithm import DistributedOnPolicyAlgorithm
 from sb3_policyflow.kernels import reason_kernels_are_off
-from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
-class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
+class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
@@ -53,7 +53,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
-    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
+    unsaved = (*DistributedOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
+    progress_attributes = ("n_rollouts", "adaptive_learning_rate", "_adaptive_start")
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
     trust_region: str = "ppo"
@@ -200,7 +201,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         if self.adaptive_learning_rate is None or not trains_actor:
             return
         self.adaptive_learning_rate = rule.adapt(
-            self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
+            self.adaptive_learning_rate,
+            self.ranks.mean(th.stack(kls).mean()),
+            self.value_of("desired_kl"),
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
@@ -215,11 +218,12 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
+        batch_size = self.ranks.share("batch_size", self.batch_size)
         for _ in range(self.n_epochs):  # line 13
             kls = [] if rule.window == "epoch" else kls
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
-            for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
+            for batch in self.rollout_buffer.minibatches(samples, batch_size):  # line 14
                 features, critic_features = self.policy.actor_critic_features(batch.observations)
                 terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
                 advantages = self._normalized(batch.advantages, "minibatch")
@@ -232,7 +236,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
                 metrics.add_means({"value_loss": value_loss, **terms.metrics})
                 loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
                 kls.append(terms.kl.detach())
-                stop = self.target_kl is not None and terms.kl.item() > 1.5 * self.target_kl
+                stop = (
+                    self.target_kl is not None and self.ranks.mean(kls[-1]) > 1.5 * self.target_kl
+                )
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
@@ -250,8 +256,10 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
         """Advantages, shape (n,), normalized if this is the scope in which that is done."""
         # One sample has no standard deviation.
-        if self.normalize_advantage and self.advantage_scope == scope and len(advantages) > 1:
-            return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        n_samples = self.ranks.size * len(advantages)
+        if self.normalize_advantage and self.advantage_scope == scope and n_samples > 1:
+            mean, std = self.ranks.mean_std(advantages)
+            return (advantages - mean) / (std + 1e-8)
         return advantages
 
     def _optimize(
@@ -265,6 +273,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
         th.autograd.backward(loss, inputs=trained)
+        loss = self.ranks.average_gradients(parameters, loss)
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
         self.policy.optimizer.step()
@@ -283,12 +292,12 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         for name in ("clip_range", "clip_range_vf"):
             if getattr(self, name) is not None:
                 logged[name] = self.value_of(name)
-        for name, value in {**metrics.summary(), **logged}.items():
+        for name, value in self.ranks.average_metrics({**metrics.summary(), **logged}).items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
+        """Save the model; see :meth:`DistributedOnPolicyAlgorithm.save`."""
         options.note_changed_options(self)
         self.read_learning_rate()
         super().save(path, exclude, include)

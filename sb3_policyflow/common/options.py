@@ -285,7 +285,7 @@ def check_algorithm(model: Any) -> None:
                 f"policy_kwargs, as {name}(..., {option}=...)."
             )
     check_values(model)
-    checks.warn_of_batches(model.batch_size, model.n_steps, model.n_envs)
+    checks.warn_of_batches(model.batch_size, model.n_steps, model.ranks.size * model.n_envs)
 
 
 def check_values(model: Any) -> None:

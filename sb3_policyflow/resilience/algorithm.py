@@ -20,6 +20,7 @@ from sb3_policyflow.resilience.collection import (
     PendingBonus,
     StepChecks,
     rollback_statistics,
+    statistics_of,
     terminal_observations,
     time_limits,
 )
@@ -69,7 +70,13 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
-    unsaved: ClassVar[tuple[str, ...]] = ("_callback", "_step_checks", "_saved_random_states")
+    unsaved: ClassVar[tuple[str, ...]] = (
+        "_callback",
+        "_step_checks",
+        "_saved_random_states",
+        "rank",
+        "other_resume_states",
+    )
     """Attributes that no file has."""
 
     _callback: BaseCallback | None = None
@@ -77,6 +84,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
+    rank: int = 0
+    """Which of the processes that train this model this one is."""
+    other_resume_states: tuple[ResumeState, ...] = ()
+    """Those of the processes after the first, which saves the model."""
 
     # Collecting rollouts
 
@@ -187,12 +198,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         :param exclude: Attributes not to save, such as "resume_state".
         :param include: Attributes to save that SB3 leaves out.
         """
-        normalize = self.get_vec_normalize_env()
-        # SB3 saves the attributes that it finds.
-        self.resume_state = ResumeState(
-            random_states=self._saved_random_states or RandomStates.now(self.device),
-            normalized_returns=None if normalize is None else normalize.returns.copy(),
-        )
+        # SB3 saves the attributes that it finds, the last observations of this process too.
+        state = self.own_resume_state()._replace(last_obs=None, last_episode_starts=None)
+        self.resume_state = state._replace(others=self.other_resume_states)
         try:
             if isinstance(path, (str, pathlib.Path)):
                 with atomic_write(path, suffix="zip") as file:
@@ -201,6 +209,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 super().save(path, exclude, include)
         finally:
             del self.resume_state
+
+    def own_resume_state(self) -> ResumeState:
+        """What this process needs to go on as it would have."""
+        normalize = self.get_vec_normalize_env()
+        return ResumeState(
+            random_states=self._saved_random_states or RandomStates.now(self.device),
+            normalized_returns=None if normalize is None else normalize.returns.copy(),
+            last_obs=self._last_obs,
+            last_episode_starts=self._last_episode_starts,
+            statistics=statistics_of(normalize),
+        )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self.unsaved]
@@ -244,7 +263,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
         # Files of SB3's own algorithms have none.
-        state: ResumeState | None = model.__dict__.pop("resume_state", None)
+        saved: ResumeState | None = model.__dict__.pop("resume_state", None)
+        state = None if saved is None else saved.of_rank(model.rank)
         if not force_reset:
             model._continue_episodes(state)
         if state is not None and not reseed and "seed" not in kwargs:
@@ -262,6 +282,13 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     def _continue_episodes(self, state: ResumeState | None) -> None:
         """Check an environment that is not reset against the last observations."""
+        if self.rank > 0:
+            if state is None or state.last_episode_starts is None:
+                raise ValueError(
+                    f"The model was not saved by as many ranks, and rank {self.rank} cannot "
+                    "continue in the middle of its episodes: leave out force_reset=False."
+                )
+            self._last_obs, self._last_episode_starts = state.last_obs, state.last_episode_starts
         if self.env is None or self._last_episode_starts is None:
             return
         n_saved = len(self._last_episode_starts)

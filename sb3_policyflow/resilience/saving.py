@@ -1,7 +1,7 @@
 """What SB3 does not save, though the rest of a run depends on it."""
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -43,10 +43,26 @@ def preserve_rng_state(device: th.device) -> Iterator[None]:
 
 
 class ResumeState(NamedTuple):
-    """Random states, and the running discounted returns of ``VecNormalize``, shape (n_envs,).
+    """What a process needs to go on as it would have, besides what SB3 saves.
 
-    ``VecNormalize`` leaves them out of its own ``save``; None if the model has no such wrapper.
+    Random states, and the running discounted returns of ``VecNormalize``, shape (n_envs,), which it
+    leaves out of its own ``save``; None if the model has no such wrapper. Where several processes
+    train the model, ``others`` has the states of all but the first, with their last observations
+    and episode starts, and ``statistics`` the attributes of ``VecNormalize`` that are running
+    statistics: a run that is restarted goes on with them by itself.
     """
 
     random_states: RandomStates
     normalized_returns: np.ndarray | None
+    last_obs: Any = None
+    last_episode_starts: np.ndarray | None = None
+    others: "tuple[ResumeState, ...]" = ()
+    statistics: Mapping[str, Any] | None = None
+
+    def of_rank(self, rank: int) -> "ResumeState | None":
+        """What a process finds in the file; None if fewer have trained the model.
+
+        :param rank: Its number.
+        """
+        states = (self, *self.others)
+        return states[rank] if rank < len(states) else None
