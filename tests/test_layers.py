@@ -14,12 +14,13 @@ BELOW: dict[str, set[str]] = {
     "flows": set(),
     "resilience": set(),
     "kernels": {"flows"},
-    "common": {"flows", "kernels", "resilience"},
+    "distributed": {"resilience"},
+    "common": {"distributed", "flows", "kernels", "resilience"},
     **{name: {"common", "flows"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
     "export": {"common", "algorithms"},
-    "integrations": {"algorithms", "envs", "policyflow", "resilience"},
+    "integrations": {"algorithms", "distributed", "envs", "policyflow", "resilience"},
     "benchmark": {"common", "envs", "integrations", "resilience", "__init__"},
 }
 """What each folder or module of the package may import."""

@@ -15,6 +15,7 @@ import yaml
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
+from sb3_policyflow.integrations.rl_zoo3.ranks import share_experiment
 
 
 def extend_experiment(manager: Any, own_algorithms: Container[str], config_given: bool) -> None:
@@ -34,6 +35,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
     ):
         manager.vec_env_class = make_native_vec_env
     if is_own_algorithm:
+        share_experiment(manager)
         manager.objective = prune_if_diverged(manager.objective)
 
 
