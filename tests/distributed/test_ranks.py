@@ -78,7 +78,7 @@ def test_rank_0_writes_and_counts_for_all(tmp_path: Path) -> None:
     assert len(first["episodes"]) == 4
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "best",
-        "evaluations.npz",
+        "evaluations",
         "log",
         "model_0.zip",
     ]

@@ -74,12 +74,11 @@ def run_with_fault(fault: str) -> tuple[str, float, bool]:
 
     :param fault: "environment raises", "reward is NaN", "update raises", "loss is NaN", "killed".
     """
-    env = make_vec_env("Pendulum-v1", 2)
-    model = model_of(env)
+    model = model_of(make_vec_env("Pendulum-v1", 2), batch_size=24)
     callback = FaultCallback(fault) if current().rank == 1 else None
     began = time.monotonic()
     try:
-        model.learn(16 * 4 * 10, callback=callback)
+        model.learn(1000, callback=callback)
     except (RuntimeError, ArithmeticError) as error:
         sentence = f"{type(error).__name__}: {error}"
         return sentence, time.monotonic() - began, bool(th.isfinite(weights(model)).all())
