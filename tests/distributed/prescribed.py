@@ -12,6 +12,7 @@ from unittest import mock
 import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.buffers import FlowRolloutBuffer, FlowRolloutBufferSamples
@@ -38,6 +39,13 @@ CASES = [
 ]
 
 
+class DoubleFeatures(FlattenExtractor):
+    """The observations in double precision; SB3 makes them single."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations).double()
+
+
 class DoubleBuffer(FlowRolloutBuffer):
     """Gives its samples in double precision, in which there are no kernels."""
 
@@ -45,18 +53,25 @@ class DoubleBuffer(FlowRolloutBuffer):
         return map_tensors(lambda values: values.double(), super().samples())
 
 
-def make_model(algorithm: type[Any], n_envs: int, **options: Any) -> Any:
+def make_model(algorithm: type[Any], n_envs: int, double: bool = False, **options: Any) -> Any:
     """A model whose velocity is not zero at the start."""
-    return algorithm(
+    policy_kwargs: dict[str, Any] = {"initialization": "glorot", "net_arch": [16], "embedding_dim": 16}
+    if double:
+        policy_kwargs["features_extractor_class"] = DoubleFeatures
+        options["rollout_buffer_class"] = DoubleBuffer
+    model = algorithm(
         "MlpPolicy",
         make_vec_env("Pendulum-v1", n_envs),
         n_steps=N_STEPS,
         batch_size=BATCH_SIZE,
         n_epochs=3,
         seed=1,
-        policy_kwargs={"initialization": "glorot", "net_arch": [16], "embedding_dim": 16},
+        policy_kwargs=policy_kwargs,
         **options,
     )
+    if double:
+        model.policy.double()
+    return model
 
 
 def make_rollouts(algorithm: str) -> list[dict[str, Any]]:
@@ -92,10 +107,7 @@ def trained(
                 super().train()
 
     Prescribed.__name__ = algorithm
-    buffer = {"rollout_buffer_class": DoubleBuffer} if double else {}
-    model = make_model(Prescribed, N_ENVS // size, **OPTIONS[options], **buffer)
-    if double:
-        model.policy.double()
+    model = make_model(Prescribed, N_ENVS // size, double, **OPTIONS[options])
     model.learn(N_UPDATES * N_STEPS * N_ENVS)
     return {
         "weights": weights(model),
@@ -151,4 +163,5 @@ def train_all(rollouts: dict[str, list[dict[str, Any]]], size: int) -> dict[Any,
     :param rollouts: Those of each algorithm.
     :param size: Ranks that call this.
     """
-    return {case: trained(*case, rollouts[case[0]], size) for case in CASES}
+    cases = [case for case in CASES if case[0] in rollouts]
+    return {case: trained(*case, rollouts[case[0]], size) for case in cases}
