@@ -23,20 +23,17 @@ N_STEPS, N_ENVS, BATCH_SIZE, N_UPDATES = 16, 4, 16, 3
 ARRAYS = ("observations", "actions", "values", "advantages", "returns")
 ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "clipped, adaptive": {"max_grad_norm": 0.1, "desired_kl": 1e-4},
+    "clipped, adaptive": {"max_grad_norm": 0.1, "desired_kl": 0.01},
     "rollout, adaptive in minibatches": {
         "advantage_scope": "rollout",
-        "desired_kl": 1e-3,
+        "desired_kl": 0.02,
         "lr_adaptation_kwargs": {"interval": "minibatch"},
     },
-    "early stop": {"target_kl": 2e-4, "learning_rate": 1e-3, "clip_range_vf": 0.1},
+    "early stop": {"target_kl": 5e-3, "learning_rate": 1e-3, "clip_range_vf": 0.1},
 }
-CASES = [
-    (algorithm, options, double)
-    for algorithm in ALGORITHMS
-    for options in OPTIONS
-    for double in (False, True)
-]
+CASES = [(algorithm, options, True) for algorithm in ALGORITHMS for options in OPTIONS]
+CASES += [(algorithm, "clipped, adaptive", False) for algorithm in ALGORITHMS]
+"""Algorithm, options, and whether in double precision; single is that of the kernels."""
 
 
 class DoubleFeatures(FlattenExtractor):
@@ -55,7 +52,11 @@ class DoubleBuffer(FlowRolloutBuffer):
 
 def make_model(algorithm: type[Any], n_envs: int, double: bool = False, **options: Any) -> Any:
     """A model whose velocity is not zero at the start."""
-    policy_kwargs: dict[str, Any] = {"initialization": "glorot", "net_arch": [16], "embedding_dim": 16}
+    policy_kwargs: dict[str, Any] = {
+        "initialization": "glorot",
+        "net_arch": [16],
+        "embedding_dim": 16,
+    }
     if double:
         policy_kwargs["features_extractor_class"] = DoubleFeatures
         options["rollout_buffer_class"] = DoubleBuffer

@@ -39,7 +39,7 @@ def test_the_same_rollouts_give_the_same_parameters(
 
 
 def test_the_decisions_were_made(results: dict[int, Any]) -> None:
-    of_algorithm = {name: results[1][name, "early stop", True]["updates"] for name in ALGORITHMS}
-    assert min(of_algorithm.values()) < 9
-    rates = {results[1][case]["learning rate"] for case in CASES if "adaptive" in case[1]}
-    assert len(rates) > 1
+    stopped = [results[1][name, "early stop", True]["updates"] for name in ALGORITHMS]
+    assert min(stopped) < 9
+    rates = [results[1][case]["learning rate"] for case in CASES if "adaptive" in case[1]]
+    assert all(rate != 3e-4 for rate in rates)
