@@ -13,12 +13,15 @@ import torch as th
 from torch import distributed as dist
 
 from sb3_policyflow.distributed.ranks import RankError, Ranks
+from sb3_policyflow.distributed.shared_memory import SharedSum, share_memory
 
 T = TypeVar("T")
 UPDATE_TIMEOUT = timedelta(minutes=10)
 """How long an update waits for a rank that neither answers nor closes its connections."""
 ROLLOUT_TIMEOUT = timedelta(days=1)
 """How long ranks wait between updates: while rank 0 evaluates, for instance."""
+LEAST_SHARED = 2**18
+"""Bytes of memory that ranks of one machine share, at least."""
 SENTENCE = "sb3_policyflow/sentence"
 """Where a rank that stops leaves its sentence for the others."""
 
@@ -38,6 +41,8 @@ class ProcessGroup(Ranks):
         super().__init__(rank, size)
         self._control: Any = None  # a group of CPUs, for what is not part of an update
         self._store: Any = None
+        self._shared_sum: SharedSum | None = None
+        self._may_share = True
         self._has_stopped = False
 
     # The beginning and the end
@@ -80,6 +85,8 @@ class ProcessGroup(Ranks):
             if self._store is not None and not isinstance(error, RankError):
                 sentence = f"Rank {self.rank} has stopped. {type(error).__name__}: {error}"
                 self._store.set(SENTENCE, sentence)
+        if self._shared_sum is not None:
+            self._shared_sum.stop()
         self._control = None
         if dist.is_initialized():
             with suppress(RuntimeError):
@@ -181,9 +188,22 @@ class ProcessGroup(Ranks):
     def _sum(self, values: th.Tensor) -> th.Tensor:
         """The sum of the ranks' tensors in place; to the last bit the same on each."""
         with self._answered():
-            takes_cpu = values.is_cuda or dist.get_backend() != "nccl"
-            dist.all_reduce(values, group=None if takes_cpu else self._control)
+            shared = self._shared(values.nbytes) if values.device.type == "cpu" else None
+            if shared is not None:
+                shared.add(values)
+            else:
+                takes_cpu = values.is_cuda or dist.get_backend() != "nccl"
+                dist.all_reduce(values, group=None if takes_cpu else self._control)
         return values
+
+    def _shared(self, n_bytes: int) -> SharedSum | None:
+        """Memory through which so many bytes can be added, if all ranks are on one machine."""
+        is_small = self._shared_sum is not None and n_bytes > self._shared_sum.capacity
+        if self._may_share and (self._shared_sum is None or is_small):
+            n_bytes = max(n_bytes, LEAST_SHARED)
+            self._shared_sum = share_memory(self, n_bytes, UPDATE_TIMEOUT.total_seconds())
+            self._may_share = self._shared_sum is not None
+        return self._shared_sum
 
 
 @functools.cache
