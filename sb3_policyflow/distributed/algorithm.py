@@ -5,7 +5,6 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
-import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -35,12 +34,12 @@ class DistributedOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     _shared_training: Any = None
     """What the ranks do together, while they learn."""
 
-    def __init__(self, *args: Any, device: th.device | str = "auto", **kwargs: Any) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.ranks = current()
         self.rank = self.ranks.rank
         if self.ranks.size > 1:
-            use_own_gpu(device)
-        super().__init__(*args, device=device, **kwargs)
+            use_own_gpu(kwargs.get("device", "auto"))
+        super().__init__(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Each rank's environments have seeds of their own.
@@ -72,11 +71,10 @@ class DistributedOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
         self._shared_training = SharedTraining(self)
         try:
-            return self._shared_training.run(
-                super().learn, *arguments, reset_num_timesteps, progress_bar
-            )
+            self._shared_training.run(super().learn, *arguments, reset_num_timesteps, progress_bar)
         finally:
             self._shared_training = None
+        return self
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if self._shared_training is not None:

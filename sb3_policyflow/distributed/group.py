@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import torch as th
 from torch import distributed as dist
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
 from sb3_policyflow.distributed.ranks import RankError, Ranks
 from sb3_policyflow.distributed.shared_memory import SharedSum, share_memory
@@ -63,8 +65,8 @@ class ProcessGroup(Ranks):
                 backend = "nccl" if device.type == "cuda" else "gloo"
                 if backend == "nccl":
                     _check_gpus()
-                dist.init_process_group(backend, timeout=UPDATE_TIMEOUT)
-            self._store = dist.distributed_c10d._get_default_store()
+                _initialize(backend)
+            self._store = _of_this_attempt(dist.distributed_c10d._get_default_store())
             self._control = dist.new_group(backend="gloo", timeout=ROLLOUT_TIMEOUT)
 
     @contextmanager
@@ -139,7 +141,7 @@ class ProcessGroup(Ranks):
                     "those of the last good step and can be saved: lower the learning rate."
                 )
         flat /= self.size
-        parts = flat.split([gradient.numel() for gradient in gradients] + [self.size])
+        parts = th.split(flat, [gradient.numel() for gradient in gradients] + [self.size])
         th._foreach_copy_(gradients, [p.view_as(g) for p, g in zip(parts, gradients, strict=False)])
         return parts[-1].sum()
 
@@ -212,6 +214,20 @@ def process_group() -> ProcessGroup:
     if dist.is_initialized():
         return ProcessGroup(dist.get_rank(), dist.get_world_size())
     return ProcessGroup(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+
+
+def _initialize(backend: str) -> None:
+    """What torch does by default, with a store that no earlier attempt has written to."""
+    store, rank, size = next(rendezvous("env://", timeout=UPDATE_TIMEOUT))
+    dist.init_process_group(
+        backend, store=_of_this_attempt(store), rank=rank, world_size=size, timeout=UPDATE_TIMEOUT
+    )
+
+
+def _of_this_attempt(store: Any) -> Any:
+    """A part of a store: torchrun keeps it when it restarts its processes."""
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    return PrefixStore(f"sb3_policyflow/{attempt}", store)
 
 
 def _check_gpus() -> None:

@@ -40,7 +40,7 @@ class SharedSum:
     def __init__(self, memory: mmap.mmap, rank: int, size: int, timeout: float) -> None:
         # The first line has the token, then each rank has a line, and two rows.
         head = np.frombuffer(memory, np.int64, size * LINE // 8, offset=LINE).reshape(size, -1)
-        self._turns, self._processes = head[:, 0], head[:, 1]
+        self._turns, self._processes, self._stopped = head[:, 0], head[:, 1], head[:, 2]
         self._rows = np.frombuffer(memory, np.uint8, offset=(size + 1) * LINE).reshape(2, size, -1)
         self._rank = rank
         self._timeout = timeout
@@ -68,7 +68,7 @@ class SharedSum:
 
     def stop(self) -> None:
         """Tell the others that this rank has stopped."""
-        self._turns[self._rank] = -1
+        self._stopped[self._rank] = 1
 
     def _wait(self) -> None:
         """Wait until every rank has begun this turn."""
@@ -87,7 +87,7 @@ class SharedSum:
 
     def _check(self, waited: float) -> None:
         """Refuse to wait for what will not come."""
-        if self._turns.min() < 0:
+        if self._stopped.any():
             raise RuntimeError("a rank has stopped")
         if waited > self._timeout:
             raise RuntimeError(f"a rank has not answered for {waited:.0f} s")

@@ -3,7 +3,7 @@
 import inspect
 import io
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -15,7 +15,6 @@ from sb3_policyflow.distributed.callback import RankCallback, as_callback, witho
 from sb3_policyflow.distributed.group import ProcessGroup, process_group
 from sb3_policyflow.distributed.statistics import MergedStatistics, running_statistics
 
-T = TypeVar("T")
 OWN = {"env", "policy", "seed", "verbose", "tensorboard_log", "device", "stats_window_size"}
 """Arguments in which the ranks may differ, or that cannot be compared."""
 
@@ -52,14 +51,14 @@ class SharedTraining:
 
     def run(
         self,
-        learn: Callable[..., T],
+        learn: Callable[..., object],
         total_timesteps: int,
         callback: MaybeCallback,
         log_interval: int,
         tb_log_name: str,
         reset_num_timesteps: bool,
         progress_bar: bool,
-    ) -> T:
+    ) -> None:
         """Call SB3's ``learn`` on every rank, and end all if one of them ends with an error.
 
         :param learn: SB3's, of this rank's model; the other arguments are its own.
@@ -75,7 +74,7 @@ class SharedTraining:
                 total_timesteps, reset_num_timesteps = max(end - model.num_timesteps, 0), False
             self._start_alike()
             arguments = total_timesteps, callback, log_interval, tb_log_name
-            return learn(*arguments, reset_num_timesteps, progress_bar=False)
+            learn(*arguments, reset_num_timesteps, progress_bar=False)
 
     def _check(self, total_timesteps: int) -> None:
         """Refuse ranks that would not do the same, and what cannot be shared out."""

@@ -33,7 +33,7 @@ def test_the_zoo_shares_environments_and_writes_one_folder(tmp_path: Path) -> No
     (run,) = (tmp_path / "policyflow").iterdir()
     names = {path.name for path in run.iterdir()}
     assert {f"{i}.monitor.csv" for i in range(4)} | {"Pendulum-v1.zip", "best_model.zip"} <= names
-    model = PolicyFlow.load(run / "Pendulum-v1")
+    model = PolicyFlow.load(run / "Pendulum-v1.zip")
     assert (model.num_timesteps, model.batch_size, model.n_envs) == (1024, 32, 2)
     config = yaml.unsafe_load((run / "Pendulum-v1" / "config.yml").read_text(encoding="utf-8"))
     assert config["n_envs"] == 4

@@ -89,7 +89,7 @@ def kill_a_rank(folder: Path, seconds: float) -> Outcome:
         run.kill()
         return Outcome(seconds, None, "it hangs")
     if run.returncode != 0:
-        return Outcome(seconds, None, f"exit code {run.returncode}: {errors.decode()[-2000:]}")
+        return Outcome(seconds, None, f"exit code {run.returncode}: {errors.decode()[-6000:]}")
     return Outcome(seconds, *look_at(folder))
 
 
