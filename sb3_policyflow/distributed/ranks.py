@@ -123,9 +123,9 @@ def _is_initialized() -> bool:
 def use_own_gpu(device: th.device | str) -> None:
     """Let "cuda" mean the GPU that torchrun has for this process.
 
-    :param device: What the user wants.
+    :param device: What the user wants; a GPU of a number of its own stays that one.
     """
-    if th.device("cpu" if device == "auto" else device).type == "cpu" and device != "auto":
-        return
-    if th.cuda.is_available():
-        th.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % th.cuda.device_count())
+    wanted = th.device("cuda" if device == "auto" else device)
+    if wanted.type == "cuda" and th.cuda.is_available():
+        own = int(os.environ.get("LOCAL_RANK", "0")) % th.cuda.device_count()
+        th.cuda.set_device(own if wanted.index is None else wanted.index)
