@@ -6,6 +6,7 @@ for all environments together; each rank takes what belongs to its own. Nothing 
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -17,6 +18,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.buffers import FlowRolloutBuffer, FlowRolloutBufferSamples
 from sb3_policyflow.common.tree import map_tensors
+from sb3_policyflow.distributed import shared_memory
 from tests.helpers import collect, weights
 
 N_STEPS, N_ENVS, BATCH_SIZE, N_UPDATES = 16, 4, 16, 3
@@ -166,3 +168,11 @@ def train_all(rollouts: dict[str, list[dict[str, Any]]], size: int) -> dict[Any,
     """
     cases = [case for case in CASES if case[0] in rollouts]
     return {case: trained(*case, rollouts[case[0]], size) for case in cases}
+
+
+def train_all_through_sockets(
+    rollouts: dict[str, list[dict[str, Any]]], size: int
+) -> dict[Any, Any]:
+    """What comes of every case, as between machines, which share no memory."""
+    shared_memory.FOLDER = Path("no such folder")
+    return train_all(rollouts, size)
