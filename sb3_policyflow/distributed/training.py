@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
@@ -17,6 +18,10 @@ from sb3_policyflow.distributed.statistics import MergedStatistics, running_stat
 
 OWN = {"env", "policy", "seed", "verbose", "tensorboard_log", "device", "stats_window_size"}
 """Arguments in which the ranks may differ, or that cannot be compared."""
+
+
+LARGEST_OBSERVATIONS = 2**20
+"""Bytes of a rank's last observations up to which they go into a file: all go through rank 0."""
 
 
 class RolloutReport(NamedTuple):
@@ -133,7 +138,10 @@ class SharedTraining:
     def _synchronize(self) -> None:
         """Where nothing is under way: bring to rank 0 what a file needs, and buffers from it."""
         model, group = self.model, self.group
-        model.other_resume_states = tuple(group.gather_on_first(model.own_resume_state())[1:])
+        state = model.own_resume_state()._replace(statistics=None)
+        if _n_bytes(state.last_obs) > LARGEST_OBSERVATIONS:
+            state = state._replace(last_obs=None, last_episode_starts=None)
+        model.other_resume_states = tuple(group.gather_on_first(state)[1:])
         buffers = list(model.policy.buffers())
         if buffers:
             firsts = group.from_first([buffer.cpu() for buffer in buffers])
@@ -168,3 +176,9 @@ class SharedTraining:
         if stopped:
             model.num_timesteps = min(stopped)
         return not stopped
+
+
+def _n_bytes(observations: Any) -> int:
+    """The size of observations, an array or a dictionary of them."""
+    arrays = observations.values() if isinstance(observations, dict) else [observations]
+    return sum(np.asarray(array).nbytes for array in arrays)

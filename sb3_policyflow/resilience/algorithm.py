@@ -285,7 +285,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         if self.rank > 0:
             if state is None or state.last_episode_starts is None:
                 raise ValueError(
-                    f"The model was not saved by as many ranks, and rank {self.rank} cannot "
+                    f"The file has no last observations of rank {self.rank}, which cannot "
                     "continue in the middle of its episodes: leave out force_reset=False."
                 )
             self._last_obs, self._last_episode_starts = state.last_obs, state.last_episode_starts
