@@ -284,7 +284,8 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
             self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
-        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
+        kept = self.rollout_buffer.values, self.rollout_buffer.returns
+        values, returns = (th.as_tensor(each).cpu().numpy() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
         if hasattr(self.policy, "log_std"):

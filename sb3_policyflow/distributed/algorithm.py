@@ -11,11 +11,11 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
+from sb3_policyflow.device.algorithm import DeviceOnPolicyAlgorithm
 from sb3_policyflow.distributed.ranks import Alone, Ranks, current, use_own_gpu
-from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
-class DistributedOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
+class DistributedOnPolicyAlgorithm(DeviceOnPolicyAlgorithm):
     """A resilient algorithm whose ``learn`` all ranks call together, if there are several.
 
     Each rank brings environments of its own, as many as the others. What is counted or given for
@@ -26,7 +26,7 @@ class DistributedOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     progress_attributes: ClassVar[tuple[str, ...]] = ()
     """What a run counts besides SB3's counters, its parameters and its optimizer."""
-    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "ranks", "_shared_training")
+    unsaved = (*DeviceOnPolicyAlgorithm.unsaved, "ranks", "_shared_training")
     ranks: Ranks = Alone()
     """The processes that train this model."""
     run_id: str = ""

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -85,7 +86,8 @@ class RankCallback(BaseCallback):
         self.model.num_timesteps += self.n_others * self.training_env.num_envs
         self.num_timesteps = self.model.num_timesteps
         infos = self.locals["infos"]
-        for index in np.flatnonzero(self.locals["dones"]).tolist():
+        dones = th.as_tensor(self.locals["dones"]).cpu().numpy()
+        for index in np.flatnonzero(dones).tolist():
             for name, found in (("episode", self.episodes), ("is_success", self.successes)):
                 if infos[index].get(name) is not None:
                     found.append(infos[index][name])

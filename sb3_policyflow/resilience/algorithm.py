@@ -142,12 +142,18 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         try:
             with self._guarded():
                 self._callback = callback
-                complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+                complete = self._collect(env, callback, rollout_buffer, n_rollout_steps)
         finally:
             self._callback = None
         if complete:
             check_rollout(rollout_buffer, first_timestep)
         return complete
+
+    def _collect(
+        self, env: VecEnv, callback: BaseCallback, buffer: RolloutBuffer, n_steps: int
+    ) -> bool:
+        """SB3's own loop."""
+        return super().collect_rollouts(env, callback, buffer, n_steps)
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None

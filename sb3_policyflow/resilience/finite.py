@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
 
@@ -48,14 +49,15 @@ def check_rollout(buffer: RolloutBuffer, first_timestep: int) -> None:
 
     The environment has seen the actions clipped to their bounds.
 
-    :param buffer: The rollout, with arrays of shape (n_steps, n_envs, ...).
+    :param buffer: The rollout, with arrays or tensors of shape (n_steps, n_envs, ...).
     :param first_timestep: Timesteps before it.
     :raises FloatingPointError: With the first step and environment concerned.
     """
     advice = "lower the learning rate, and normalize observations and rewards with VecNormalize"
     for name in ("actions", "values", "advantages", "returns"):
-        array = getattr(buffer, name)
-        if not np.isfinite(array).all():
+        values = th.as_tensor(getattr(buffer, name))
+        if not th.isfinite(values).all():
+            array = values.cpu().numpy()
             finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
             step = np.flatnonzero(~finite)[0]
             timestep = first_timestep + (int(step) + 1) * buffer.n_envs

@@ -28,6 +28,8 @@ from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
 
 ROOT = Path(__file__).parents[2]
 N_ROLLOUTS, N_STEPS, N_ENVS = 40, 32, 8
+MOMENTS = random.Random()
+"""Apart from the generator that loading a model seeds."""
 TOTAL = N_ROLLOUTS * N_STEPS * 2 * N_ENVS
 
 
@@ -73,7 +75,7 @@ def kill_a_rank(folder: Path, seconds: float) -> Outcome:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--max-restarts=1"]
     command += ["--nproc-per-node=2", __file__, "train", str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    rank = random.randrange(2)
+    rank = MOMENTS.randrange(2)
     run = subprocess.Popen(
         command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
@@ -115,7 +117,7 @@ def main(n_kills: int) -> int:
     wrong = 0
     for number in range(n_kills):
         with tempfile.TemporaryDirectory() as folder:
-            outcome = kill_a_rank(Path(folder), seconds=random.uniform(0.0, 5.0))
+            outcome = kill_a_rank(Path(folder), seconds=MOMENTS.uniform(0.0, 6.0))
         wrong += bool(outcome.wrong)
         sys.stdout.write(f"{number + 1}: {outcome}\n")
         sys.stdout.flush()

@@ -1,5 +1,6 @@
 """IsaacLab's script and presets, on fakes of its versions 2 and 3."""
 
+import argparse
 import importlib
 import json
 import os
@@ -14,7 +15,7 @@ from fakes import EACH, FAKES, SMALL, TASKS, assert_refused
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.integrations.isaaclab import lab, presets
-from sb3_policyflow.integrations.isaaclab.train import main, read_agent
+from sb3_policyflow.integrations.isaaclab.train import main, read_agent, run
 
 
 def run_script(version: str | None, folder: Path, *arguments: str) -> str:
