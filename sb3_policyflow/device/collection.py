@@ -17,7 +17,7 @@ from sb3_policyflow.envs.tensor import (
     map_observations,
 )
 from sb3_policyflow.resilience.collection import ADVICE
-from sb3_policyflow.resilience.finite import check_finite
+from sb3_policyflow.resilience.finite import all_finite, check_finite
 
 
 def tensors_behind(env: VecEnv) -> tuple[TensorEnvAdapter, VecNormalize | None] | None:
@@ -79,7 +79,7 @@ class DeviceCollection:
         """
         model, callback = self.model, self.callback
         model.policy.set_training_mode(False)
-        self.buffer.reset()
+        vars(self.buffer).update(pos=0, full=False, generator_ready=False)
         self.obs = obs_as_tensor(model._last_obs, self.device)
         self._check_shapes()
         self.starts = th.as_tensor(model._last_episode_starts, device=self.device)
@@ -101,10 +101,11 @@ class DeviceCollection:
         """One step of every environment; whether the callbacks let the training go on."""
         model = self.model
         actions, values, record = model.policy(self.obs)
+        low, high = self._bounds
         if model.policy.squash_output:
-            clipped = model.policy.unscale_action(actions)
+            clipped = low + (0.5 * (actions + 1.0) * (high - low))
         else:
-            clipped = th.clamp(actions, *self._bounds)
+            clipped = th.clamp(actions, low, high)
         step = self.env.env.step(clipped)
         self._last = step
         dones = step.terminated | step.truncated
@@ -191,14 +192,18 @@ class DeviceCollection:
         row |= {f"observations/{key}": part for key, part in of_keys.items()}
         if not self._stored:
             self.record_type = type(record)
-            self._stored = {
-                name: values.new_empty(
-                    n_steps, *part.shape, dtype=th.float32 if part.dtype == th.bool else part.dtype
-                )
-                for name, part in row.items()
-            }
+            self._stored = {name: self._memory(name, n_steps, part) for name, part in row.items()}
         for name, part in row.items():
             self._stored[name][index] = part
+
+    def _memory(self, name: str, n_steps: int, part: th.Tensor) -> th.Tensor:
+        """A tensor for all steps, (n_steps, n_envs, ...): that of the rollout before if it fits."""
+        kept: dict[str, th.Tensor] = vars(self.buffer).setdefault("kept_tensors", {})
+        dtype = th.float32 if part.dtype == th.bool else part.dtype
+        memory, shape = kept.get(name), (n_steps, *part.shape)
+        if memory is None or (memory.shape, memory.dtype) != (shape, dtype):
+            memory = kept[name] = th.empty(shape, dtype=dtype, device=self.device)
+        return memory
 
     def _fill_buffer(self, last_values: th.Tensor) -> None:
         """Let the buffer have the rollout, with advantages and returns."""
@@ -251,7 +256,7 @@ class DeviceCollection:
             is_checked = name == "rewards" or (
                 name.startswith("observations/") and not self.model.allow_nan_observations
             )
-            if is_checked and not th.isfinite(values).all():
+            if is_checked and not all_finite(values):
                 what = name.replace("observations/", "observation ").replace("rewards", "reward")
                 finite = th.isfinite(values).flatten(1).all(dim=1)
                 step = int((~finite).nonzero()[0])

@@ -83,7 +83,7 @@ def test_log_and_callbacks_are_sb3s() -> None:
         logs.append(dict(model.logger.name_to_value))
         episodes.append([(round(e["r"], 4), e["l"]) for e in seen.episodes])
     assert episodes[0] == episodes[1]
-    assert len(episodes[1]) > N_ENVS
+    assert len(episodes[1]) >= N_ENVS
     assert logs[0].keys() == logs[1].keys()
 
 
