@@ -63,6 +63,8 @@ class DeviceCollection:
         self.normalizer = TensorNormalizer(normalize, self.device)
         self.first_timestep: int = model.num_timesteps
         self._stored: dict[str, th.Tensor] = {}
+        self._rows: dict[str, list[th.Tensor]] = {}
+        self._increments = th.ones_like(env.episodes)
         self._ended: list[tuple[th.Tensor, th.Tensor, th.Tensor | None]] = []
         self._last: TensorStep
         space = model.action_space
@@ -82,7 +84,7 @@ class DeviceCollection:
         vars(self.buffer).update(pos=0, full=False, generator_ready=False)
         self.obs = obs_as_tensor(model._last_obs, self.device)
         self._check_shapes()
-        self.starts = th.as_tensor(model._last_episode_starts, device=self.device)
+        self.starts = th.as_tensor(model._last_episode_starts, device=self.device).float()
         callback.on_rollout_start()
         with th.no_grad():
             for step in range(n_steps):
@@ -91,6 +93,7 @@ class DeviceCollection:
                     return False
             last_values = model.policy.predict_values(self.obs).flatten()
         self._leave()
+        self._put_together()
         self._check_finite()
         self._fill_buffer(last_values)
         callback.update_locals({"values": last_values, "rollout_buffer": self.buffer})
@@ -114,13 +117,14 @@ class DeviceCollection:
         model.num_timesteps += self.env.num_envs
         names = self._locals(index, n_steps, actions, values, record)
         names |= {"clipped_actions": clipped, "new_obs": new_obs, "rewards": rewards}
-        names |= {"dones": dones, "infos": LazyInfos(step, *self._count(step))}
+        names |= {"dones": dones, "infos": LazyInfos(step, *self._count(step, dones))}
         self.callback.update_locals(names)
         if not self.callback.on_step():
             return False
         rewards = self._bootstrapped(rewards, step)
-        self._store(index, n_steps, actions, rewards, values, record)
-        self.obs, self.starts = new_obs, dones
+        row = {"actions": actions.flatten(1), "rewards": rewards, "values": values.flatten()}
+        self._store(index, n_steps, {**row, "episode_starts": self.starts}, record)
+        self.obs, self.starts = new_obs, dones.float()
         return True
 
     def _locals(
@@ -140,24 +144,23 @@ class DeviceCollection:
             "log_probs": record,
         }
 
-    def _count(self, step: TensorStep) -> tuple[th.Tensor, th.Tensor]:
+    def _count(self, step: TensorStep, dones: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Returns and lengths of the episodes that have ended, shape (k,) each."""
-        env, ended = self.env, step.ended
-        env.episode_returns += step.rewards
-        env.episode_lengths += 1
-        counts = env.episode_returns[ended], env.episode_lengths[ended]
-        if len(ended) > 0:
-            env.episode_returns[ended] = 0.0
-            env.episode_lengths[ended] = 0
-            self._ended.append((*counts, step.successes))
-        return counts
+        episodes = self.env.episodes
+        self._increments[0] = step.rewards
+        episodes += self._increments
+        returns, lengths = episodes[:, step.ended]
+        if len(step.ended) > 0:
+            episodes.masked_fill_(dones, 0.0)
+            self._ended.append((returns, lengths, step.successes))
+        return returns, lengths
 
     def _bootstrapped(self, rewards: th.Tensor, step: TensorStep) -> th.Tensor:
         """Rewards with the values with which episodes continue beyond their time limits."""
         model = self.model
         if len(step.ended) == 0 or model.timeout_bootstrap == "none":
             return rewards
-        limits = (step.truncated & ~step.terminated)[step.ended]
+        limits = step.truncated[step.ended] & ~step.terminated[step.ended]
         which = step.ended[limits]
         if len(which) == 0:
             return rewards
@@ -171,39 +174,34 @@ class DeviceCollection:
         rewards[which] += self.buffer.gamma * values
         return rewards
 
-    def _store(
-        self,
-        index: int,
-        n_steps: int,
-        actions: th.Tensor,
-        rewards: th.Tensor,
-        values: th.Tensor,
-        record: Any,
-    ) -> None:
+    def _store(self, index: int, n_steps: int, row: dict[str, th.Tensor], record: Any) -> None:
         """Keep one step; what the buffer calls its arrays is what they are called here."""
-        row = {
-            "actions": actions.flatten(1),
-            "rewards": rewards,
-            "values": values.flatten(),
-            "episode_starts": self.starts,
-            **record._asdict(),
-        }
+        self.record_type = type(record)
+        # No one writes to these any more: they are put together at the end, which costs less.
+        for name, part in {**row, **record._asdict()}.items():
+            self._rows.setdefault(name, []).append(part)
+        # Observations may be large, as images are, and two copies of a rollout too much.
         of_keys = self.obs if isinstance(self.obs, dict) else {"": self.obs}
-        row |= {f"observations/{key}": part for key, part in of_keys.items()}
-        if not self._stored:
-            self.record_type = type(record)
-            self._stored = {name: self._memory(name, n_steps, part) for name, part in row.items()}
-        for name, part in row.items():
+        for key, part in of_keys.items():
+            name = f"observations/{key}"
+            if name not in self._stored:
+                self._stored[name] = self._memory(name, n_steps, part)
             self._stored[name][index] = part
 
     def _memory(self, name: str, n_steps: int, part: th.Tensor) -> th.Tensor:
         """A tensor for all steps, (n_steps, n_envs, ...): that of the rollout before if it fits."""
         kept: dict[str, th.Tensor] = vars(self.buffer).setdefault("kept_tensors", {})
-        dtype = th.float32 if part.dtype == th.bool else part.dtype
         memory, shape = kept.get(name), (n_steps, *part.shape)
-        if memory is None or (memory.shape, memory.dtype) != (shape, dtype):
-            memory = kept[name] = th.empty(shape, dtype=dtype, device=self.device)
+        if memory is None or (memory.shape, memory.dtype) != (shape, part.dtype):
+            memory = kept[name] = th.empty(shape, dtype=part.dtype, device=self.device)
         return memory
+
+    def _put_together(self) -> None:
+        """Make one tensor of the steps' tensors of each name."""
+        for name, parts in self._rows.items():
+            memory = self._memory(name, len(parts), parts[0])
+            self._stored[name] = th.stack(parts, out=memory)
+        self._rows.clear()
 
     def _fill_buffer(self, last_values: th.Tensor) -> None:
         """Let the buffer have the rollout, with advantages and returns."""
@@ -233,7 +231,7 @@ class DeviceCollection:
         model._last_episode_starts = self.starts.cpu().numpy().astype(bool)
         for returns, lengths, successes in self._ended:
             for episode_return, length in zip(returns.tolist(), lengths.tolist(), strict=True):
-                model.ep_info_buffer.append({"r": episode_return, "l": length})
+                model.ep_info_buffer.append({"r": episode_return, "l": int(length)})
             if successes is not None:
                 model.ep_success_buffer.extend(successes.tolist())
 
@@ -275,13 +273,13 @@ def advantages_of(
 
     :param stored: ``rewards``, ``values`` and ``episode_starts``, shape (n_steps, n_envs).
     :param last_values: Values of the observations after the last step, shape (n_envs,).
-    :param dones: Whether the last step has ended each episode, shape (n_envs,).
+    :param dones: 1 where the last step has ended an episode, else 0, shape (n_envs,).
     :param buffer: Has gamma and lambda.
     :return: Shape (n_steps, n_envs).
     """
     rewards, values, starts = (stored[name] for name in ("rewards", "values", "episode_starts"))
     advantages = th.empty_like(rewards)
-    following, continues = last_values, 1.0 - dones.float()
+    following, continues = last_values, 1.0 - dones
     advantage = th.zeros_like(last_values)
     for step in reversed(range(len(rewards))):
         delta = rewards[step] + buffer.gamma * following * continues - values[step]

@@ -42,6 +42,7 @@ class TensorStep(NamedTuple):
 class TensorVecEnv(Protocol):
     """A batch of environments that takes and returns tensors on one device.
 
+    What it has returned it does not change later, and the caller does not either.
     An environment may also have ``seed(seed)``, whose seed is for the next ``reset``, and
     ``close()``.
     """
@@ -123,9 +124,8 @@ class TensorEnvAdapter(VecEnv):
 
     def __init__(self, env: TensorVecEnv) -> None:
         self.env = env
-        self.episode_returns = th.zeros(env.num_envs, device=env.device)
-        """Sums of the rewards of the episodes so far, where rollouts are collected as tensors."""
-        self.episode_lengths = th.zeros(env.num_envs, dtype=th.int64, device=env.device)
+        self.episodes = th.zeros(2, env.num_envs, device=env.device)
+        """Sum of the rewards and length of each episode so far, kept where rollouts are tensors."""
         self._actions: th.Tensor | None = None
         super().__init__(env.num_envs, env.observation_space, env.action_space)
 
@@ -135,8 +135,7 @@ class TensorEnvAdapter(VecEnv):
             self.env.seed(seed)
         self._reset_seeds()
         self._reset_options()
-        self.episode_returns.zero_()
-        self.episode_lengths.zero_()
+        self.episodes.zero_()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return _to_numpy(self.env.reset())
 
