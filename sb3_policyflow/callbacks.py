@@ -1,11 +1,16 @@
 """A callback that measures how good the approximations of PolicyFlow's update are."""
 
+import warnings
 from copy import deepcopy
 from typing import NamedTuple
 
+import numpy as np
 import torch as th
+from numpy.typing import ArrayLike
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
@@ -51,6 +56,10 @@ class FlowDiagnosticsCallback(BaseCallback):
     - ``action_entropy``: entropy of the actions in nats, estimated from nearest neighbors and
       averaged over states.
 
+    - ``return_drawn`` and ``return_deterministic``, if there is an ``eval_env``: mean returns of
+      episodes with actions drawn as in training and of deterministic ones. Where the latter are
+      much less, a warning says so, once.
+
     The callback does not change the training. For algorithms other than PolicyFlow only the entropy
     is logged.
 
@@ -61,6 +70,9 @@ class FlowDiagnosticsCallback(BaseCallback):
         none.
     :param n_entropy_actions: Number of actions drawn in each of these states, at least 2.
     :param verbose: See SB3.
+    :param eval_env: Environments, other than those of the training, in which to compare the returns
+        of drawn and deterministic actions.
+    :param n_eval_episodes: Episodes of each.
     :raises ValueError: If a number is too small.
     """
 
@@ -71,9 +83,12 @@ class FlowDiagnosticsCallback(BaseCallback):
         n_entropy_states: int = 16,
         n_entropy_actions: int = 64,
         verbose: int = 0,
+        eval_env: VecEnv | None = None,
+        n_eval_episodes: int = 10,
     ) -> None:
         super().__init__(verbose)
         at_least(1)("every", every)
+        at_least(2)("n_eval_episodes", n_eval_episodes)
         at_least(2)("n_samples", n_samples)
         at_least(0)("n_entropy_states", n_entropy_states)
         at_least(2)("n_entropy_actions", n_entropy_actions)
@@ -81,7 +96,10 @@ class FlowDiagnosticsCallback(BaseCallback):
         self.n_samples = n_samples
         self.n_entropy_states = n_entropy_states
         self.n_entropy_actions = n_entropy_actions
+        self.eval_env = eval_env
+        self.n_eval_episodes = n_eval_episodes
         self.n_rollouts = 0
+        self._has_warned = False
         self._before: tuple[BaseFlowPolicy, FlowRolloutBufferSamples] | None = None
 
     def _init_callback(self) -> None:
@@ -130,6 +148,8 @@ class FlowDiagnosticsCallback(BaseCallback):
                 metrics = self._compare(old, new, samples)
             if self.n_entropy_states > 0:
                 metrics["action_entropy"] = self._entropy(new, samples.observations)
+            if self.eval_env is not None:
+                metrics |= self._returns(self.eval_env)
         for name, value in metrics.items():
             self.logger.record(f"diagnostics/{name}", value.item())
 
@@ -155,6 +175,28 @@ class FlowDiagnosticsCallback(BaseCallback):
             "kl_exact": gaussian_kl(shifts.exact, *log_stds).mean(),
         }
 
+    def _returns(self, env: VecEnv) -> dict[str, th.Tensor]:
+        """Mean returns of drawn and of deterministic actions."""
+        training_env = self.model.get_env()
+        if training_env is not None:
+            sync_envs_normalization(training_env, env)
+        drawn, deterministic = (
+            evaluate_policy(
+                self.model,
+                env,
+                n_eval_episodes=self.n_eval_episodes,
+                deterministic=is_deterministic,
+                return_episode_rewards=True,
+            )[0]
+            for is_deterministic in (False, True)
+        )
+        if not self._has_warned:
+            self._has_warned = warn_of_deterministic_actions(
+                drawn, deterministic, "act and evaluate with deterministic=False"
+            )
+        means = {"return_drawn": drawn, "return_deterministic": deterministic}
+        return {name: th.as_tensor(np.mean(values)) for name, values in means.items()}
+
     def _draw_times(self, samples: FlowRolloutBufferSamples) -> th.Tensor:
         """Draw times as the algorithm does, shape (n, n_times)."""
         model = self.algorithm
@@ -166,6 +208,30 @@ class FlowDiagnosticsCallback(BaseCallback):
         """Entropy of the actions in nats, averaged over states."""
         some = rows(observations, slice(self.n_entropy_states))
         return action_entropy(policy, policy.actor_features(some), self.n_entropy_actions)
+
+
+def warn_of_deterministic_actions(drawn: ArrayLike, deterministic: ArrayLike, advice: str) -> bool:
+    """Warn if deterministic actions return much less than drawn ones.
+
+    Much less is a quarter of the greater return, and three standard errors.
+
+    :param drawn: Returns of episodes with actions drawn as in training, shape (n,).
+    :param deterministic: Returns of episodes with deterministic actions, shape (m,).
+    :param advice: What to do then.
+    :return: Whether there was something to warn of.
+    """
+    returns = [np.asarray(values, dtype=np.float64) for values in (drawn, deterministic)]
+    if min(map(len, returns)) < 2:
+        return False
+    (high, low), errors = [r.mean() for r in returns], [r.var(ddof=1) / len(r) for r in returns]
+    if high - low <= max(0.25 * max(abs(high), abs(low)), 3 * np.sqrt(sum(errors))):
+        return False
+    warnings.warn(
+        f"Deterministic actions return {low:.4g} and drawn ones {high:.4g}: one action for "
+        f"each observation may be too few for this policy. To see what was learned, {advice}.",
+        stacklevel=2,
+    )
+    return True
 
 
 def end_point_shifts(

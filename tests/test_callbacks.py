@@ -1,20 +1,29 @@
 """The diagnostics tell the truth, and change nothing."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.callbacks import FlowDiagnosticsCallback, end_point_shifts
+from sb3_policyflow.callbacks import (
+    FlowDiagnosticsCallback,
+    end_point_shifts,
+    warn_of_deterministic_actions,
+)
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from tests.helpers import SMALL, weights
 
@@ -138,3 +147,47 @@ def test_algorithms_without_a_flow() -> None:
 def test_numbers_that_are_too_small(options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="must be at least"):
         FlowDiagnosticsCallback(**options)
+
+
+class TwoWays(gym.Env[Any, Any]):
+    """Only actions other than 0 are rewarded."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), float(abs(action[0]) > 0.2), True, False, {}
+
+
+def test_returns_of_drawn_and_deterministic_actions() -> None:
+    model = PolicyFlow("MlpPolicy", Monitor(TwoWays()), **{**OPTIONS, "batch_size": 32})
+    env = make_vec_env(TwoWays, 2)
+    diagnostics = FlowDiagnosticsCallback(eval_env=env, n_eval_episodes=40)
+    collector = Collector()
+    with pytest.warns(UserWarning, match=r"Deterministic actions return 0 .* may lie betw") as told:
+        model.learn(96, [diagnostics, collector])
+    assert len(told) == 1
+    assert collector.logged[-1]["return_deterministic"] == 0
+    assert collector.logged[-1]["return_drawn"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("drawn", "deterministic", "told"),
+    [
+        ([900, 908, 910], [0, 0, 0], True),
+        ([8.2, 8.4, 8.3], [2.0, 2.1, 1.9], True),
+        ([-160, -170, -150], [-165, -140, -160], False),
+        ([10, 1, 0, 20], [7, 0, 1, 9], False),  # could be chance
+        ([0, 0], [900, 900], False),
+        ([900], [0, 0], False),
+    ],
+)
+def test_what_is_much_worse(drawn: list[float], deterministic: list[float], told: bool) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert warn_of_deterministic_actions(drawn, deterministic, "draw") is told
+    assert len(caught) == told

@@ -14,9 +14,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.export import ActionModule, export, main
+from sb3_policyflow.export import ActionModule, export
+from sb3_policyflow.export.__main__ import main
 from tests.helpers import TINY, TWO_EPOCHS
 
 ort = pytest.importorskip("onnxruntime")
@@ -151,7 +153,7 @@ def test_a_chain_without_noise_is_the_record_of_its_means(tmp_path: Path) -> Non
     found = run_onnx(tmp_path / "policy.onnx", obs, latents=latents)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     # Drawing the start in predict is for evaluation, and not what is exported.
-    model.policy.random_latents = True
+    model.policy.deterministic_action = "drawn"
     module = ActionModule(model.policy)
     assert th.equal(module(th.as_tensor(obs)), module(th.as_tensor(obs)))
 
@@ -208,5 +210,104 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"must end in '\.onnx' or '\.pt2', got 'policy\.pb'"):
         export(model.policy, "policy.pb")
     PPO("MlpPolicy", "Pendulum-v1").save(tmp_path / "ppo.zip")
-    with pytest.raises(ValueError, match="which is no flow policy"):
+    with pytest.raises(SystemExit, match="which is no flow policy"):
         main([str(tmp_path / "ppo.zip"), str(tmp_path / "policy.onnx")])
+    with pytest.raises(SystemExit, match=r"There is no file .*nope\.zip\."):
+        main([str(tmp_path / "nope"), str(tmp_path / "policy.onnx")])
+
+
+class Double(gym.Env[Any, Any]):
+    """Observations of float64, as MuJoCo's, far from zero."""
+
+    observation_space = spaces.Box(-1e6, 1e6, (3,), np.float64)
+    action_space = spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.np_random.normal(100.0, 50.0, 3), {}
+
+    def step(self, action: Any) -> Any:
+        return self.np_random.normal(100.0, 50.0, 3), 0.0, False, False, {}
+
+
+def test_the_normalization_cannot_be_forgotten(tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env(Double, 2))
+    model = trained(PolicyFlow, "MlpPolicy", env)
+    model.save(tmp_path / "model")
+    env.save(str(tmp_path / "model_vecnormalize.pkl"))
+    command = [str(tmp_path / "model"), str(tmp_path / "policy.pt2")]
+    with pytest.raises(SystemExit, match=r"give them as .*There is .*model_vecnormalize\.pkl"):
+        main(command)
+    main([*command, "--normalized-input"])
+    with pytest.raises(ValueError, match="trained with VecNormalize"):
+        export(PolicyFlow.load(tmp_path / "model"), tmp_path / "policy.pt2")
+    # Saving what was loaded without an environment does not lose it.
+    PolicyFlow.load(tmp_path / "model").save(tmp_path / "again")
+    with pytest.raises(SystemExit, match="trained with VecNormalize"):
+        main([str(tmp_path / "again"), str(tmp_path / "policy.pt2")])
+
+
+def test_rewards_alone_are_no_matter_of_the_policy(tmp_path: Path) -> None:
+    model = trained(PolicyFlow, "MlpPolicy", VecNormalize(make_vec_env(Double, 2), norm_obs=False))
+    model.save(tmp_path / "model")
+    main([str(tmp_path / "model"), str(tmp_path / "policy.pt2")])
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_the_file_takes_observations_as_the_environment_gives_them(
+    normalized: bool, tmp_path: Path
+) -> None:
+    env: Any = make_vec_env(Double, 2)
+    env = VecNormalize(env) if normalized else env
+    model = trained(PolicyFlow, "MlpPolicy", env)
+    export(model, tmp_path / "policy.onnx")
+    model.save(tmp_path / "model")
+    command = [str(tmp_path / "model"), str(tmp_path / "again.onnx")]
+    if normalized:
+        env.save(str(tmp_path / "stats.pkl"))
+        command += ["--vecnormalize", str(tmp_path / "stats.pkl")]
+    main(command)
+    observation = Double().reset(seed=0)[0][None]
+    seen = env.normalize_obs(observation) if normalized else observation
+    expected, _ = model.predict(seen, deterministic=True)
+    for name in ("policy.onnx", "again.onnx"):
+        np.testing.assert_allclose(run_onnx(tmp_path / name, observation), expected, atol=1e-5)
+
+
+QUIET = """
+import sys
+from sb3_policyflow.export.__main__ import main
+main(["model.zip", "policy.onnx"])
+import onnxruntime
+session = onnxruntime.InferenceSession("policy.onnx")
+print([axis for part in session.get_inputs() + session.get_outputs() for axis in part.shape])
+"""
+
+
+@pytest.mark.slow
+def test_nothing_is_said_beside_the_file_and_its_batch_axis_has_a_name(tmp_path: Path) -> None:
+    options = {"activation_fn": nn.Mish}
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs={**NETS, **options}, **TWO_EPOCHS)
+    model.save(tmp_path / "model")
+    output = subprocess.run(
+        [sys.executable, "-c", QUIET],
+        cwd=tmp_path,
+        check=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ).stdout
+    assert output.splitlines() == ["Wrote policy.onnx", "['batch', 3, 'batch', 1]"]
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    PolicyFlow("MlpPolicy", "Pendulum-v1").save(tmp_path / "model")
+    with pytest.raises(SystemExit, match=r"needs onnxscript: run `pip install \".*\[onnx\]\"`"):
+        main([str(tmp_path / "model"), str(tmp_path / "policy.onnx")])
+
+
+def test_help_is_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert "::" not in capsys.readouterr().out

@@ -10,19 +10,40 @@ import sb3_policyflow
 ROOT = Path(sb3_policyflow.__file__).parent
 ALGORITHMS = ("policyflow", "fpo", "dppo")
 BELOW: dict[str, set[str]] = {
-    "envs": set(),
+    "hints": set(),
+    "envs": {"hints"},
     "flows": set(),
-    "resilience": set(),
+    "resilience": {"hints"},
     "kernels": {"flows"},
     "device": {"envs", "resilience"},
     "distributed": {"device", "resilience"},
-    "common": {"distributed", "flows", "kernels", "resilience"},
-    **{name: {"common", "flows"} for name in ALGORITHMS},
+    "common": {"distributed", "flows", "hints", "kernels", "resilience"},
+    **{name: {"common", "flows", "kernels"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
-    "export": {"common", "algorithms"},
-    "integrations": {"algorithms", "distributed", "envs", "policyflow", "resilience"},
-    "benchmark": {"common", "envs", "integrations", "resilience", "__init__"},
+    "export": {"common", "algorithms", "hints", "resilience"},
+    "integrations": {
+        "algorithms",
+        "callbacks",
+        "distributed",
+        "envs",
+        "hints",
+        "imitation",
+        "policyflow",
+        "resilience",
+    },
+    "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
+    "benchmark": {
+        "callbacks",
+        "common",
+        "envs",
+        "export",
+        "hints",
+        "imitation",
+        "integrations",
+        "resilience",
+        "__init__",
+    },
 }
 """What each folder or module of the package may import."""
 

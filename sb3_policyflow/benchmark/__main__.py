@@ -13,7 +13,9 @@ COMMANDS = {
     "plot": ("figures.plot", "draw learning curves and comparisons of two algorithms"),
     "multigoal": ("multigoal", "the paper's MultiGoal figure"),
     "pointmaze": ("pointmaze", "the paper's exploration maps"),
+    "imitation": ("imitation", "MultiGoal from demonstrations, cloned and trained further"),
     "playground": ("playground", "four algorithms on tasks of MuJoCo Playground"),
+    "card": ("card", "evaluate a model and write its Hugging Face model card"),
     "speed": ("speed.training", "time PolicyFlow and PPO side by side"),
     "environments": ("speed.environments", "time environments on their own"),
 }

@@ -5,12 +5,15 @@ Writes ``trajectories.png``, ``learning_curve.png``, ``progress.csv`` and ``mode
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from tqdm import tqdm
 
+from sb3_policyflow.benchmark.errors import BenchmarkError
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.figures.progress import progress_figure
@@ -26,7 +29,7 @@ EVALUATE_EVERY = 500_000
 
 
 class GoalsCallback(BaseCallback):
-    """Logs, from time to time, which goals are reached from the center.
+    """Shows the progress of a training, and from time to time which goals its policy reaches.
 
     :param every: Environment steps between evaluations.
     """
@@ -36,10 +39,20 @@ class GoalsCallback(BaseCallback):
         self._every = every
         self._due = every
 
+    def _on_training_start(self) -> None:
+        self.bar: tqdm[Any] = tqdm(
+            total=self.model._total_timesteps, unit="step", unit_scale=True, dynamic_ncols=True
+        )
+        self.bar.set_description("first rollout")
+
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
+        self.bar.set_description("training")
+        if self.model.ep_info_buffer:
+            self.bar.set_postfix_str(f"return {training_return(self.model):.2f}")
+        self.bar.update(min(self.num_timesteps, int(self.bar.total)) - self.bar.n)
         if self.num_timesteps < self._due:
             return
         self._due += self._every
@@ -47,14 +60,26 @@ class GoalsCallback(BaseCallback):
         self.logger.record("goals/reached", report.n_goals)
         self.logger.record("goals/entropy", report.entropy)
         self.logger.record("goals/mean_return", report.mean_return)
+        self.bar.write(f"{self.num_timesteps / 1e6:5.1f} M steps: {report}")
+
+    def close(self) -> None:
+        """End the bar, also if the training was interrupted."""
+        self.bar.close()
 
 
-def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
-    """Train with the hyperparameters of ``policyflow.yml`` and SB3's progress bar.
+def training_return(model: Any) -> float:
+    """Mean return of the last 100 episodes of the training; NaN if there are none."""
+    episodes = model.ep_info_buffer or ()
+    return float(np.mean([episode["r"] for episode in episodes])) if episodes else float("nan")
+
+
+def train(seed: int, steps: int | None, folder: Path) -> tuple[OnPolicyAlgorithm, bool]:
+    """Train with the hyperparameters of ``policyflow.yml``; Ctrl-C ends it early.
 
     :param seed: Seed of the training.
     :param steps: Environment steps; those of the YAML file if not given.
     :param folder: Where the log and the model go.
+    :return: The model, and whether its training is complete.
     """
     experiment = make_experiment("policyflow", ENV, steps, seed, str(folder))
     setup = experiment.setup_experiment()
@@ -62,16 +87,23 @@ def train(seed: int, steps: int | None, folder: Path) -> OnPolicyAlgorithm:
     model = setup[0]
     assert isinstance(model, OnPolicyAlgorithm)
     model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(experiment.n_timesteps, GoalsCallback(EVALUATE_EVERY), progress_bar=True)
+    progress = GoalsCallback(EVALUATE_EVERY)
+    complete = True
+    try:
+        model.learn(experiment.n_timesteps, progress)
+    except KeyboardInterrupt:
+        complete = False
+    finally:
+        progress.close()
     model.save(folder / "model")
-    return model
+    return model, complete
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("--seed", type=int, default=0, help="default: 0")
     parser.add_argument("--steps", type=float, help="environment steps; default: the YAML file's")
-    parser.add_argument("--out", type=Path, default=Path("demo"), help="default: demo")
+    parser.add_argument("--out", type=Path, default=Path("demo"), help="a folder; default: demo")
 
 
 def main(arguments: argparse.Namespace) -> int:
@@ -79,15 +111,21 @@ def main(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     steps = None if arguments.steps is None else int(arguments.steps)
-    model = train(arguments.seed, steps, folder)
+    model, complete = train(arguments.seed, steps, folder)
+    if not complete:
+        print(f"Stopped after {model.num_timesteps:,} steps. Kept: {folder / 'model.zip'}.")
+        return 130
     trajectories = sample_trajectories(model, N_TRAJECTORIES)
     goals_figure({"PolicyFlow": trajectories}).savefig(folder / "trajectories.png")
-    progress_figure(folder / "progress.csv").savefig(folder / "learning_curve.png")
-    assert model.ep_info_buffer is not None
-    training_return = np.mean([episode["r"] for episode in model.ep_info_buffer])
+    written = [folder / "model.zip", folder / "trajectories.png"]
+    try:
+        progress_figure(folder / "progress.csv").savefig(folder / "learning_curve.png")
+        written.append(folder / "learning_curve.png")
+    except BenchmarkError as error:  # so short a training has no curve
+        print(error)
     print(
-        f"After {model.num_timesteps:,} steps the training return is {training_return:.2f}.\n"
+        f"After {model.num_timesteps:,} steps, return in training: {training_return(model):.2f}.\n"
         f"{N_TRAJECTORIES} stochastic trajectories from the center: {goal_report(trajectories)}.\n"
-        f"Pictures: {folder / 'trajectories.png'} and {folder / 'learning_curve.png'}."
+        f"Wrote {', '.join(map(str, written))}."
     )
     return 0

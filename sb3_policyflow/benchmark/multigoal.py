@@ -68,9 +68,14 @@ VARIANTS = {
 """The paper's panels (a) to (f)."""
 
 
-def load_trajectories(run: Run, folder: Path) -> Trajectories:
-    """The episodes from the center that a run kept."""
-    with np.load(run.path(folder, ".npz")) as kept:
+def load_trajectories(run: Run, folder: Path, suffix: str = ".npz") -> Trajectories:
+    """The episodes from the center that a run kept.
+
+    :param run: The run.
+    :param folder: Where its results are.
+    :param suffix: "-cloned.npz" for those before the training.
+    """
+    with np.load(run.path(folder, suffix)) as kept:
         positions = kept["positions"].astype(np.float64)
         return Trajectories(positions, kept["lengths"].astype(int), kept["returns"])
 

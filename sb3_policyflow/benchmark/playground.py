@@ -1,4 +1,4 @@
-"""PolicyFlow and its rivals on tasks of MuJoCo Playground, with a budget for a small machine.
+"""PolicyFlow, FPO, DPPO and PPO on tasks of MuJoCo Playground, with a budget for a small machine.
 
 Trains what is missing, with every task and seed, and sums up these tasks in ``table.md``,
 ``curves.png`` and ``improvement.png``. Needs the extra ``playground``.

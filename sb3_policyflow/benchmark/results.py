@@ -16,6 +16,9 @@ from sb3_policyflow.resilience.files import atomic_write
 
 DEFAULT_FOLDER = Path("benchmark-results")
 
+PROGRESS = "trained: "
+"""With what a line of a training's log begins that says how far it is."""
+
 CURVE_FIELDS = ("timesteps", "mode", "mean_return", "std_return", "mean_length", "n_episodes")
 
 

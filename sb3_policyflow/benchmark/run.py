@@ -5,16 +5,23 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
+import threading
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
 from sb3_policyflow.benchmark.errors import require_env
-from sb3_policyflow.benchmark.results import DEFAULT_FOLDER, Run
+from sb3_policyflow.benchmark.results import DEFAULT_FOLDER, PROGRESS, Run
+from sb3_policyflow.integrations.rl_zoo3.experiment import check_hyperparams
+
+EXIT = "exit code "
+"""With what the last line of a training's log begins."""
 
 
 def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int = 1) -> list[Run]:
@@ -34,6 +41,7 @@ def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int =
     failed = []
     with (
         tqdm(total=len(runs), initial=len(runs) - len(missing), unit="run") as bar,
+        steps_of_runs(missing, folder, bar),
         ThreadPoolExecutor(n_jobs) as pool,
     ):
         jobs = {pool.submit(_succeeds, run, folder, n_threads): run for run in missing}
@@ -42,9 +50,46 @@ def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int =
             if not job.result():
                 failed.append(run)
                 bar.write(f"failed: see {run.path(folder, '.log')}", file=sys.stderr)
-            bar.set_postfix_str(str(run))
             bar.update()
     return failed
+
+
+@contextmanager
+def steps_of_runs(
+    runs: Iterable[Run], folder: Path, bar: "tqdm[Any]", every: float = 2.0
+) -> Iterator[None]:
+    """Show how far the trainings are that go on, behind the bar that counts those that are done.
+
+    :param runs: The trainings.
+    :param folder: Where their logs are.
+    :param bar: The bar.
+    :param every: Seconds from one look at the logs to the next.
+    """
+    done = threading.Event()
+
+    def show() -> None:
+        while not done.wait(every):
+            shares = [f"{run}: {share}" for run in runs if (share := _share_of_steps(run, folder))]
+            bar.set_postfix_str(", ".join(shares))
+
+    watcher = threading.Thread(target=show, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watcher.join()
+
+
+def _share_of_steps(run: Run, folder: Path) -> str:
+    """How far a training is by its log; empty if it does not go on."""
+    log = run.path(folder, ".log")
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    shares = [line.removeprefix(PROGRESS) for line in lines if line.startswith(PROGRESS)]
+    return "" if not lines or lines[-1].startswith(EXIT) else (shares or ["starting"])[-1]
 
 
 def _succeeds(run: Run, folder: Path, n_threads: int) -> bool:
@@ -59,7 +104,7 @@ def _succeeds(run: Run, folder: Path, n_threads: int) -> bool:
             command, stdout=file, stderr=subprocess.STDOUT, env=os.environ | threads, check=False
         )
         # A process that was killed says nothing itself; its code is minus the signal.
-        file.write(f"exit code {outcome.returncode}\n")
+        file.write(f"{EXIT}{outcome.returncode}\n")
     if outcome.returncode == 0:
         log.unlink()
     return outcome.returncode == 0
@@ -93,7 +138,7 @@ def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     numbers = {
         "jobs": (1, "processes at a time"),
         "threads": (1, "threads of each"),
-        "evaluations": (10, "over the training"),
+        "evaluations": (10, "over the training; one a rollout, if there are fewer rollouts"),
         "episodes": (20, "of an evaluation"),
     }
     for name, (default, text) in numbers.items():
@@ -127,8 +172,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> int:
     """Run every combination of algorithms, environments and seeds."""
+    from rl_zoo3.utils import ALGOS
+
     for env in arguments.envs:
         require_env(env)
+    for algo in arguments.algos:
+        check_hyperparams(ALGOS[algo], arguments.hyperparams)
     runs = [
         Run(
             algo,

@@ -15,13 +15,24 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.costs import GradientSteps, network_evaluations
-from sb3_policyflow.benchmark.measure.evaluation import EvaluationCallback
+from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC, EvaluationCallback, evaluate
 from sb3_policyflow.benchmark.measure.goals import goal_report, sample_trajectories
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.measure.visits import VisitCounter
-from sb3_policyflow.benchmark.results import Result, Run
+from sb3_policyflow.benchmark.results import PROGRESS, Result, Run
 
 N_EVALUATION_ENVS = 10
+
+
+class ProgressCallback(BaseCallback):
+    """Writes to the log how far the training is, for the bar of the command that started it."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        share = self.num_timesteps / self.model._total_timesteps
+        print(f"{PROGRESS}{min(share, 1.0):.0%}", flush=True)
 
 
 def train_one(run: Run, folder: Path) -> Result:
@@ -41,15 +52,18 @@ def train_one(run: Run, folder: Path) -> Result:
         evaluations = EvaluationCallback(env, due, run.n_episodes)
         # Only these need the extra ``robotics``.
         counters = [VisitCounter()] if run.keep_visits else []
-        callbacks = [*manager.callbacks, *counters]
-        summary = {
-            "hyperparams": {key: str(value) for key, value in hyperparams.items()},
-            **train_and_measure(model, run.steps, evaluations, callbacks),
+        callbacks = [*manager.callbacks, ProgressCallback(), *counters]
+        summary: dict[str, Any] = {
+            "hyperparams": {key: str(value) for key, value in hyperparams.items()}
         }
+        if "demonstrations" in run.hyperparams and run.n_trajectories:
+            summary["cloned"] = evaluate(model, env, STOCHASTIC, run.n_episodes)
+            summary["cloned"]["goals"] = _keep_trajectories(model, run, folder, "-cloned.npz")
+        summary |= train_and_measure(model, run.steps, evaluations, callbacks)
         for counter in counters:
-            counter.visits().save(_archive(run, folder))
+            counter.visits().save(_archive(run, folder, ".npz"))
         if run.n_trajectories:
-            summary["goals"] = _keep_trajectories(model, run, folder)
+            summary["goals"] = _keep_trajectories(model, run, folder, ".npz")
         env.close()
         manager_env = model.get_env()
         assert manager_env is not None
@@ -104,19 +118,21 @@ def _whole_rollouts(model: OnPolicyAlgorithm, steps: int) -> int:
     return -(-steps // rollout) * rollout
 
 
-def _archive(run: Run, folder: Path) -> Path:
+def _archive(run: Run, folder: Path, suffix: str) -> Path:
     """Where arrays of a run go; the folder is made."""
-    path = run.path(folder, ".npz")
+    path = run.path(folder, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
-def _keep_trajectories(model: OnPolicyAlgorithm, run: Run, folder: Path) -> dict[str, Any]:
+def _keep_trajectories(
+    model: OnPolicyAlgorithm, run: Run, folder: Path, suffix: str
+) -> dict[str, Any]:
     """Run episodes from the center of MultiGoal, keep them, and say which goals they reached."""
     trajectories = sample_trajectories(model, run.n_trajectories)
     report = goal_report(trajectories)
     np.savez_compressed(
-        _archive(run, folder),
+        _archive(run, folder, suffix),
         positions=trajectories.positions.astype(np.float16),
         lengths=trajectories.lengths.astype(np.int16),
         returns=trajectories.returns.astype(np.float32),

@@ -1,17 +1,16 @@
 """The update that all flow algorithms share: PPO's, for policies without a likelihood."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, update_learning_rate
+from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.losses import clipped_value_loss
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -19,17 +18,25 @@ from sb3_policyflow.common.schedules import (
     parse_schedule,
     start_adaptive_learning_rate,
 )
-from sb3_policyflow.common.update import FlowUpdate, UpdateMetrics, check_step, clip_gradients
+from sb3_policyflow.common.update import (
+    FlowUpdate,
+    Loss,
+    UpdateMetrics,
+    check_model,
+    check_step,
+    clip_gradients,
+    take_step,
+)
 from sb3_policyflow.distributed.algorithm import DistributedOnPolicyAlgorithm
-from sb3_policyflow.kernels import reason_kernels_are_off
+from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
 
 
 class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
-    supported, ``max_grad_norm`` may be None or not positive for no clipping, and ``ent_coef`` may
-    be a schedule; and:
+    supported, ``max_grad_norm`` may be None or not positive for no clipping, and coefficients and
+    rates may be schedules, also as "lin_START" or "lin_START_END"; and:
 
     :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
         a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
@@ -42,6 +49,9 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         the "terminal" observation, as in SB3, of the "current" one before it, or "none".
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
+    :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
+        from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
         arguments of its policy class. They may be given in ``policy_kwargs`` instead.
     :raises ValueError: If an argument cannot be used.
@@ -50,11 +60,13 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
+    former_values: ClassVar[Mapping[str, Any]] = {"has_former_defaults": True}
+    has_former_defaults: bool = False
+    """Whether a file of version 0.1 was loaded: what it does not say, had other defaults."""
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
     unsaved = (*DistributedOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
-    progress_attributes = ("n_rollouts", "adaptive_learning_rate", "_adaptive_start")
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
     trust_region: str = "ppo"
@@ -64,7 +76,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for name in names.settable_options(cls.policy_base):
+        for name in {"random_latents", *names.settable_options(cls.policy_base)}:
             if not hasattr(cls, name):
                 setattr(cls, name, options.PolicyOption(name))
 
@@ -72,14 +84,14 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         self,
         policy: str | type[FlowPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: Coefficient = 3e-4,
         n_steps: int = 2048,
         batch_size: int = 64,
         n_epochs: int = 10,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
+        clip_range: Coefficient = 0.2,
+        clip_range_vf: Coefficient | None = None,
         normalize_advantage: bool = True,
         ent_coef: Coefficient = 0.0,
         vf_coef: float = 0.5,
@@ -102,6 +114,8 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         advantage_scope: str = "minibatch",
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
+        n_critic_warmup: int = 0,
+        imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
         self.batch_size = batch_size
@@ -115,14 +129,18 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         self.advantage_scope = advantage_scope
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
+        self.n_critic_warmup = n_critic_warmup
+        self.imitation_coef = imitation_coef
+        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
+        self.has_former_defaults = False  # an attribute of files
         self.n_rollouts = 0
         self.adaptive_learning_rate: float | None = None
         self._adaptive_start: float | None = None
         super().__init__(
             policy,
             env,
-            learning_rate=learning_rate,
+            learning_rate=cast(float, learning_rate),  # may be a string here
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
@@ -144,6 +162,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         options.read_loaded_options(self)
+        names.keep_former_defaults(self)
         options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
@@ -152,12 +171,11 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         super()._setup_model()
         self.policy_kwargs = own
         self.known_policy_options = options.values_on_policy(self)
-        self.clip_range = FloatSchedule(self.clip_range)
+        self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:
-            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+            self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
         start_adaptive_learning_rate(self)
-        for check in self.model_checks:
-            check(self)
+        check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
@@ -171,7 +189,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         return float(schedule(self._current_progress_remaining))
 
     def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
+        self.lr_schedule = parse_schedule("learning_rate", self.learning_rate)
         self._learning_rates = self.learning_rate, self.lr_schedule
 
     def read_learning_rate(self) -> None:
@@ -200,13 +218,13 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         # An actor that does not learn gives no reason to learn faster.
         if self.adaptive_learning_rate is None or not trains_actor:
             return
+        kl = self.ranks.mean(th.stack(kls).mean())
         self.adaptive_learning_rate = rule.adapt(
-            self.adaptive_learning_rate,
-            self.ranks.mean(th.stack(kls).mean()),
-            self.value_of("desired_kl"),
+            self.adaptive_learning_rate, kl, self.value_of("desired_kl")
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
+    @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         self._update_learning_rate(self.policy.optimizer)
@@ -214,31 +232,19 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
-        clip_range_vf = None if self.clip_range_vf is None else self.value_of("clip_range_vf")
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
-        batch_size = self.ranks.share("batch_size", self.batch_size)
         for _ in range(self.n_epochs):  # line 13
             kls = [] if rule.window == "epoch" else kls
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
-            for batch in self.rollout_buffer.minibatches(samples, batch_size):  # line 14
-                features, critic_features = self.policy.actor_critic_features(batch.observations)
-                terms = update.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
+            for batch in self.rollout_buffer.minibatches(samples, update.batch_size):  # line 14
                 advantages = self._normalized(batch.advantages, "minibatch")
-                policy_loss = update.surrogate_loss(terms.log_ratio, advantages, metrics)  # line 19
-                # Squared error of the values against the TD(lambda) returns
-                values = self.policy.values(critic_features).flatten()
-                value_loss = clipped_value_loss(
-                    values, batch.old_values, batch.returns, clip_range_vf
-                )
-                metrics.add_means({"value_loss": value_loss, **terms.metrics})
-                loss = policy_loss + terms.regularizer + self.vf_coef * value_loss
-                kls.append(terms.kl.detach())
-                stop = (
-                    self.target_kl is not None and self.ranks.mean(kls[-1]) > 1.5 * self.target_kl
-                )
+                # Lines 18 to 21: ratio, surrogate objective, regularizers, error of the values
+                loss, kl = update.loss(batch._replace(advantages=advantages), metrics)
+                kls.append(kl)
+                stop = self.target_kl is not None and self.ranks.mean(kl) > 1.5 * self.target_kl
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
@@ -255,16 +261,10 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
 
     def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
         """Advantages, shape (n,), normalized if this is the scope in which that is done."""
-        # One sample has no standard deviation.
-        n_samples = self.ranks.size * len(advantages)
-        if self.normalize_advantage and self.advantage_scope == scope and n_samples > 1:
-            mean, std = self.ranks.mean_std(advantages)
-            return (advantages - mean) / (std + 1e-8)
-        return advantages
+        is_due = self.normalize_advantage and self.advantage_scope == scope
+        return self.ranks.normalized(advantages) if is_due else advantages
 
-    def _optimize(
-        self, loss: th.Tensor, parameters: list[th.nn.Parameter], trains_actor: bool
-    ) -> None:
+    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
@@ -272,22 +272,22 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         for parameter in parameters:
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
-        th.autograd.backward(loss, inputs=trained)
-        loss = self.ranks.average_gradients(parameters, loss)
+        loss.backward(inputs=trained)
+        mean_loss = self.ranks.average_gradients(parameters, loss.item())
         norm = clip_gradients(parameters, self.max_grad_norm)
-        check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
-        self.policy.optimizer.step()
+        check_step(mean_loss, norm, self.num_timesteps, self.divergence_advice)
+        take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
 
-    def _log_update(self, loss: th.Tensor, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
+    def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
             self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
         kept = self.rollout_buffer.values, self.rollout_buffer.returns
-        values, returns = (th.as_tensor(each).cpu().numpy() for each in kept)
+        arrays = (th.as_tensor(each).cpu().numpy().flatten() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
-        logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
+        logged["explained_variance"] = explained_variance(*arrays)
         if hasattr(self.policy, "log_std"):
             logged["std"] = self.policy.log_std.exp().mean().item()
         for name in ("clip_range", "clip_range_vf"):

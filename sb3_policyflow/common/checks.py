@@ -2,13 +2,16 @@
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from torch import nn
 
 from sb3_policyflow.common.buffers import (
     DictFlowRolloutBuffer,
@@ -159,6 +162,69 @@ def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any])
             f"{getattr(policy_class, '__name__', policy_class)}: use 'MlpFlowPolicy', "
             "'CnnFlowPolicy' or 'MultiInputFlowPolicy', or derive your own from "
             f"{base.__module__}.{base.__name__}."
+        )
+
+
+def check_networks(
+    net_arch: object, activation_fn: object, optimizer_class: object, extractor_class: object
+) -> None:
+    """Refuse networks that cannot be built, before PyTorch does so in words of its own.
+
+    :param net_arch: Hidden layers, or None.
+    :param activation_fn: A module's class.
+    :param optimizer_class: An optimizer's class.
+    :param extractor_class: A features extractor's class, or None.
+    :raises ValueError: With what to give instead.
+    """
+    parts = net_arch if isinstance(net_arch, dict) else {"pi": net_arch or []}
+    sizes = [size for layers in parts.values() for size in _as_list(layers)]
+    are_sizes = all(isinstance(size, Integral) and int(size) > 0 for size in sizes)
+    if not are_sizes or not parts.keys() <= {"pi", "vf"}:
+        raise ValueError(
+            "net_arch must be a list of layer sizes, such as [64, 64], or "
+            f"dict(pi=[64, 64], vf=[64, 64]), got {net_arch!r}."
+        )
+    classes = {
+        "activation_fn": (activation_fn, nn.Module, "torch.nn.ReLU"),
+        "optimizer_class": (optimizer_class, th.optim.Optimizer, "torch.optim.Adam"),
+        "features_extractor_class": (
+            extractor_class or BaseFeaturesExtractor,
+            BaseFeaturesExtractor,
+            "stable_baselines3.common.torch_layers.NatureCNN",
+        ),
+    }
+    for name, (given, base, example) in classes.items():
+        # A function that returns an activation or an optimizer serves as well as a class.
+        if isinstance(given, (str, nn.Module)) or not callable(given):
+            raise ValueError(
+                f"{name} must be a class derived from {base.__name__}, such as {example} (the "
+                f"class itself, without quotes or brackets), got {given!r}."
+            )
+
+
+def _as_list(layers: object) -> list[Any]:
+    """The layers of a part; what is no list of them becomes one that is refused."""
+    is_list = isinstance(layers, Sequence) and not isinstance(layers, str)
+    return list(cast("Sequence[Any]", layers)) if is_list else [layers]
+
+
+def check_extractor(
+    algorithm: str,
+    policy_class: type[Any],
+    policy_kwargs: Mapping[str, Any],
+    observation_space: object,
+) -> None:
+    """Refuse a policy for other observations.
+
+    :raises ValueError: With the policy to use.
+    """
+    extractor = policy_kwargs.get("features_extractor_class")
+    extractor = extractor or policy_class.default_features_extractor_class
+    is_dict = isinstance(observation_space, spaces.Dict)
+    if extractor is CombinedExtractor and not is_dict:
+        raise ValueError(
+            f"{policy_class.__name__} is for observations that are a Dict, and these are "
+            f"{observation_space}: use {algorithm}('MlpPolicy', ...), or 'CnnPolicy' for images."
         )
 
 

@@ -1,11 +1,15 @@
-"""The terms of the objective as pure functions of tensors."""
+"""The terms of the objective: pure functions of tensors, and the pull towards a cloned policy."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any
 
 import torch as th
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
+
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.flows import MatchingSamples
 
 SMALLEST_CLIP_RANGE = 1e-6
 """Epsilon of the penalties that divide by it, at least."""
@@ -155,3 +159,51 @@ def ratio_divergence(log_ratio: th.Tensor) -> th.Tensor:
     :return: The divergence, a tensor without dimensions.
     """
     return (th.expm1(log_ratio) - log_ratio).mean()
+
+
+def matched_outputs(policy: Any, drawn: MatchingSamples, features: th.Tensor) -> th.Tensor:
+    """What a policy's network says at the points of flow matching, shape (n, action_dim).
+
+    :param policy: The policy.
+    :param drawn: The points.
+    :param features: The actor's features, shape (n, features_dim).
+    """
+    # Behind its own, DPPO has features for networks that are not trained.
+    features = features[:, : policy.mlp_extractor.latent_dim_pi]
+    outputs: th.Tensor = policy.velocity(drawn.points, drawn.times, features)
+    return outputs
+
+
+class ImitationPull:
+    """Pulls a policy towards the one that was cloned from demonstrations.
+
+    coef E ||g (v - v_cloned)||^2    at points on the way from drawn latents to the actions taken
+
+    v is the velocity, and g = 1; of DPPO the network's output, which g turns into what the mean of
+    the next step changes by.
+
+    :param policy: The policy that learns.
+    :param parameters: Its parameters when it had been cloned, by name.
+    :param coef: Weight of the pull at the present progress.
+    """
+
+    def __init__(self, policy: Any, parameters: Mapping[str, Any], coef: float) -> None:
+        self._policy, self.coef = policy, coef
+        self._cloned = deepcopy(policy).requires_grad_(False)
+        tensors = {name: th.as_tensor(values) for name, values in parameters.items()}
+        self._cloned.load_state_dict(tensors, strict=False)
+        self._cloned.set_training_mode(False)
+
+    def loss(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> th.Tensor:
+        """The pull before it is multiplied by its weight, a tensor without dimensions.
+
+        :param batch: A minibatch of n samples.
+        :param features: The actor's features, shape (n, features_dim).
+        """
+        drawn = self._policy.draw_matching(batch.actions.flatten(1))
+        with th.no_grad():
+            cloned_features = self._cloned.actor_features(batch.observations)
+            cloned = matched_outputs(self._cloned, drawn, cloned_features)
+        change = matched_outputs(self._policy, drawn, features) - cloned
+        pull: th.Tensor = (drawn.gains.unsqueeze(-1) * change).square().sum(dim=-1).mean()
+        return pull

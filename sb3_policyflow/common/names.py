@@ -2,17 +2,30 @@
 
 import inspect
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from difflib import get_close_matches
+from collections.abc import Collection, Mapping
 from typing import Any
 
+import torch as th
+from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
 
-FORMER_VALUES = {("time_sampler", "starts"): "grid_without_end"}
+from sb3_policyflow.hints import did_you_mean, either, nearest
+
+FORMER_VALUES: dict[tuple[str, object], str] = {
+    ("time_sampler", "starts"): "grid_without_end",
+    ("deterministic_action", True): "drawn",  # was random_latents
+    ("deterministic_action", False): "zero",
+}
 """Present values of options by option and former value."""
+
+FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
+"""Defaults of policies in version 0.1, where they are others now."""
 
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
+    "use_sde": OF_GSDE,
+    "sde_sample_freq": OF_GSDE,
     "full_std": OF_GSDE,
     "use_expln": OF_GSDE,
     "squash_output": (
@@ -37,6 +50,48 @@ NOT_CALLED = {
 
 NOT_CALLED_BY_TRAINING = ("evaluate_actions", "get_distribution")
 """Methods of SB3's policies that PPO trains with, and flow algorithms do not."""
+
+
+class FormerAttribute:
+    """An attribute under its former name, with former values, for those who set it later.
+
+    :param present: Its present name.
+    """
+
+    def __init__(self, present: str) -> None:
+        self._present = present
+
+    def __set_name__(self, owner: type[Any], name: str) -> None:
+        self._name = name
+
+    def __get__(self, holder: Any, owner: type[Any] | None = None) -> Any:
+        return self if holder is None else getattr(holder, self._present)
+
+    def __set__(self, holder: Any, value: object) -> None:
+        changed = with_present_names({self._name: value}, {self._name: self._present})
+        setattr(holder, self._present, changed[self._present])
+
+
+class WithoutLikelihood:
+    """SB3's methods of policies that make no sense without a likelihood of actions, refused."""
+
+    def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
+        """Refuse: SB3's distributions say how likely actions are."""
+        raise self._no_likelihood()
+
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> Any:  # noqa: ARG002
+        """Refuse: the likelihood of an action under a flow policy has no closed form."""
+        raise self._no_likelihood()
+
+    def reset_noise(self, n_envs: int = 1) -> None:  # noqa: ARG002
+        """Refuse: this is gSDE's noise."""
+        raise TypeError(f"{type(self).__name__} does not support gSDE, whose noise this resets.")
+
+    def _no_likelihood(self) -> TypeError:
+        return TypeError(
+            f"{type(self).__name__} has no closed-form likelihood of actions, which PPO needs: "
+            "make, load and train it with the flow algorithms of sb3_policyflow, which need none."
+        )
 
 
 def check_overridden_methods(policy_class: type[Any], base: type[Any]) -> None:
@@ -69,7 +124,25 @@ def own_options(policy_class: type[Any]) -> list[inspect.Parameter]:
 
 def settable_options(policy_class: type[Any]) -> set[str]:
     """Names of the options of a policy that are attributes of its algorithm too."""
-    return {"random_latents"} | {option.name for option in own_options(policy_class)}
+    return {"deterministic_action"} | {option.name for option in own_options(policy_class)}
+
+
+def keep_former_defaults(model: Any) -> None:
+    """Give the policy of a file of version 0.1 the defaults of that version.
+
+    :param model: An algorithm whose attributes have just been loaded, or set.
+    """
+    if not model.has_former_defaults:
+        return
+    model.has_former_defaults = False
+    kwargs = model.policy_kwargs or {}
+    given = with_present_names(kwargs, model.former_names, warn=False).keys() | model.policy_options
+    taken = policy_parameters(model.policy_class)
+    for name, value in FORMER_DEFAULTS.items():
+        # A class of the user's own may have a default of its own.
+        own, base = taken.get(name), policy_parameters(model.policy_base).get(name)
+        if name not in given and own and base and own.default == base.default:
+            model.policy_options[name] = value
 
 
 def policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
@@ -106,20 +179,72 @@ def unknown_argument(
         )
     if name in FOREIGN_ARGUMENTS:
         return TypeError(f"{owner} has no {name}: {FOREIGN_ARGUMENTS[name]}")
-    similar = get_close_matches(name, sorted({*own, *of_policy}), cutoff=0.55)
+    similar = nearest(name, {*own, *of_policy})
     places = [n if n in own else f"{n} in policy_kwargs" for n in similar]
-    meant = f"did you mean {_either(places)}?" if places else f"help({owner}) shows those it has."
+    meant = f"did you mean {either(places)}?" if places else f"help({owner}) shows those it has."
     return TypeError(f"{owner} has no argument {name!r}: {meant}")
 
 
-def _either(names: Iterable[str]) -> str:
-    """The names in a sentence.
+def check_names(
+    signature: inspect.Signature,
+    policy_class: type[Any],
+    args: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> None:
+    """Refuse arguments that an algorithm does not have, and one that would have no effect.
 
-    >>> _either(["a", "b", "c"])
-    'a, b or c'
+    :param signature: The signature of the algorithm's constructor.
+    :param policy_class: The base of its policies.
+    :param args: What was given by position, the algorithm first.
+    :param options: What was given by name.
+    :raises TypeError: With where an argument belongs, or which one may be meant.
+    :raises ValueError: If there is no policy of a name, or options of gSDE are given.
     """
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
+    model, policy, *_ = (*args, options.get("policy"))
+    if isinstance(policy, str) and policy not in model.policy_aliases:
+        raise ValueError(
+            f"{type(model).__name__} has no policy {policy!r}: "
+            f"{did_you_mean(policy, model.policy_aliases)}"
+        )
+    if not isinstance(options.get("policy_kwargs") or {}, dict):
+        raise ValueError(
+            f"policy_kwargs must be a dictionary, such as dict(net_arch=[64, 64]), got "
+            f"{options['policy_kwargs']!r}."
+        )
+    if isinstance(policy, type) and issubclass(policy, policy_class):
+        policy_class = policy
+    own = signature.parameters.keys() - {"self"}
+    for name in options.keys() - own:
+        of_policy = policy_parameters(policy_class).keys() - own
+        raise unknown_argument(type(model).__name__, name, own, of_policy)
+    if options.get("sde_sample_freq", -1) != -1:
+        raise ValueError(
+            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
+            "not support: leave it out."
+        )
+
+
+def check_saved_by(model: Any) -> None:
+    """Refuse a file that another algorithm has saved.
+
+    :param model: An algorithm whose attributes are those of the file.
+    :raises ValueError: With the algorithm to load it with.
+    """
+    name, policy_class = type(model).__name__, model.policy_class
+    if issubclass(policy_class, model.policy_base):
+        return
+    shared: Any = type(model).__base__
+    siblings = [
+        cls.__name__ for cls in shared.__subclasses__() if issubclass(policy_class, cls.policy_base)
+    ]
+    of_sb3 = {"SACPolicy": "SAC", "TD3Policy": "TD3", "DQNPolicy": "DQN"}
+    # A file of PPO has made a schedule of the number that is there at first.
+    of_sb3["ActorCriticPolicy"] = "PPO" if callable(model.clip_range) else "A2C"
+    names = [cls.__name__ for cls in policy_class.__mro__]
+    saver, *_ = siblings + [of_sb3[base] for base in names if base in of_sb3] + [""]
+    if not saver:
+        raise ValueError(f"This file holds a {names[0]}, which {name} did not save.")
+    raise ValueError(f"This file was saved by {saver}, not by {name}: use {saver}.load.")
 
 
 def with_present_names(
@@ -142,14 +267,11 @@ def with_present_names(
             {**(present.get(name) or {}), key: options[former]} if key else options[former]
         )
         _warn_if(warn, f"{former} is now {former_names[former].replace('.', ' with the key ')}")
-    for name, former in _former_values(present):
-        present[name] = FORMER_VALUES[name, former]
-        _warn_if(warn, f"{name}={former!r} is now {present[name]!r}")
+    for (name, value), replacement in FORMER_VALUES.items():
+        if present.get(name) == value:
+            present[name] = replacement
+            _warn_if(warn, f"{name}={value!r} is now {replacement!r}")
     return present
-
-
-def _former_values(options: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    yield from [pair for pair in FORMER_VALUES if options.get(pair[0]) == pair[1]]
 
 
 def _warn_if(warn: bool, change: str) -> None:

@@ -8,10 +8,12 @@ from typing import Any, ParamSpec, TypedDict, cast
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.names import (
+    FOREIGN_ARGUMENTS,
+    check_names,
+    check_saved_by,
     named_parameters,
     own_options,
     policy_parameters,
@@ -24,7 +26,9 @@ from sb3_policyflow.common.schedules import (
     check_desired_kl,
     check_lr_adaptation,
     parse_schedule,
+    positive_at_first,
 )
+from sb3_policyflow.common.update import check_cloned, check_model
 
 P = ParamSpec("P")
 
@@ -36,14 +40,14 @@ class FlowOptions(TypedDict, total=False):
     :class:`~sb3_policyflow.common.algorithm.FlowOnPolicyAlgorithm`.
     """
 
-    learning_rate: float | Schedule
+    learning_rate: Coefficient
     n_steps: int
     batch_size: int
     n_epochs: int
     gamma: float
     gae_lambda: float
-    clip_range: float | Schedule
-    clip_range_vf: float | Schedule | None
+    clip_range: Coefficient
+    clip_range_vf: Coefficient | None
     normalize_advantage: bool
     ent_coef: Coefficient
     vf_coef: float
@@ -65,12 +69,14 @@ class FlowOptions(TypedDict, total=False):
     advantage_scope: str
     timeout_bootstrap: str
     allow_nan_observations: bool
+    n_critic_warmup: int
+    imitation_coef: Coefficient
 
 
 SHARED_CHECKS: dict[str, checks.Check] = {
-    "learning_rate": checks.or_schedule(checks.between(0.0)),
-    "clip_range": checks.or_schedule(checks.between(0.0)),
-    "clip_range_vf": checks.or_schedule(checks.positive_or_none),
+    "learning_rate": parse_schedule,
+    "clip_range": positive_at_first,
+    "clip_range_vf": checks.or_none(positive_at_first),
     "vf_coef": checks.between(0.0),
     "gamma": checks.between(0.0, 1.0),
     "gae_lambda": checks.between(0.0, 1.0),
@@ -83,11 +89,14 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "n_epochs": checks.at_least(1),
     "advantage_scope": checks.one_of(("minibatch", "rollout")),
     "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
+    "n_critic_warmup": checks.at_least(0),
+    "imitation_coef": parse_schedule,
 }
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
 
 FORMER_NAMES = {
     "_n_rollouts": "n_rollouts",
+    "random_latents": "deterministic_action",
     "lr_adaptation": "lr_adaptation_kwargs.interval",
     "lr_factor": "lr_adaptation_kwargs.factor",
     "lr_bounds": "lr_adaptation_kwargs.bounds",
@@ -122,7 +131,7 @@ def shares_options(
         @functools.wraps(init)
         def completed(*args: Any, **options: Any) -> None:
             options = with_present_names(options, former_names)
-            _check_names(signature, policy_class, args, options)
+            check_names(signature, policy_class, args, options)
             given = signature.bind(*args, **options).arguments
             twice = sorted(names & given.keys() & (given.get("policy_kwargs") or {}).keys())
             if twice:
@@ -149,31 +158,6 @@ def _complete_signature(
     merged = {**shared, **own, **{option.name: option for option in own_options(policy_class)}}
     parameters = sorted(merged.values(), key=lambda parameter: parameter.kind)
     return inspect.Signature(parameters, return_annotation=None)
-
-
-def _check_names(
-    signature: inspect.Signature,
-    policy_class: type[Any],
-    args: tuple[Any, ...],
-    options: Mapping[str, Any],
-) -> None:
-    """Refuse arguments that an algorithm does not have, and one that would have no effect.
-
-    :raises TypeError: With where an argument belongs, or which one may be meant.
-    :raises ValueError: If options of gSDE are given.
-    """
-    model, policy, *_ = (*args, options.get("policy"))
-    if isinstance(policy, type) and issubclass(policy, policy_class):
-        policy_class = policy
-    own = signature.parameters.keys() - {"self"}
-    for name in options.keys() - own:
-        of_policy = policy_parameters(policy_class).keys() - own
-        raise unknown_argument(type(model).__name__, name, own, of_policy)
-    if options.get("sde_sample_freq", -1) != -1:
-        raise ValueError(
-            f"sde_sample_freq={options['sde_sample_freq']} belongs to gSDE, which flow policies do "
-            "not support: leave it out."
-        )
 
 
 class PolicyOption:
@@ -275,17 +259,25 @@ def check_algorithm(model: Any) -> None:
     :raises ValueError: With what to use instead.
     """
     name, space = type(model).__name__, getattr(model, "observation_space", None)
+    # Only what a file has set is there before networks are made.
+    is_loaded = "lr_schedule" in vars(model)
     checks.check_environment(name, model.env, space)
     checks.check_flow_spaces(model.action_space, model.use_sde)
+    if is_loaded:
+        check_saved_by(model)
     checks.check_policy_class(name, model.policy_class, model.policy_base)
+    checks.check_extractor(name, model.policy_class, model.policy_kwargs or {}, space)
     for option in (model.policy_kwargs or {}).keys() - policy_parameters(model.policy_class):
+        if option in FOREIGN_ARGUMENTS:
+            raise unknown_argument(model.policy_class.__name__, option, ())
         if option in inspect.signature(type(model)).parameters:
             raise TypeError(
                 f"{option} is an option of the algorithm and not of its policy: take it out of "
                 f"policy_kwargs, as {name}(..., {option}=...)."
             )
     check_values(model)
-    checks.warn_of_batches(model.batch_size, model.n_steps, model.ranks.size * model.n_envs)
+    if not is_loaded:
+        checks.warn_of_batches(model.batch_size, model.n_steps, model.ranks.size * model.n_envs)
 
 
 def check_values(model: Any) -> None:
@@ -295,9 +287,8 @@ def check_values(model: Any) -> None:
     :raises ValueError: With what to use instead.
     """
     checks.check_options(model)
-    checks.check_batch_size(
-        model.batch_size, model.n_steps, model.n_envs, model.normalize_advantage
-    )
+    sizes = model.batch_size, model.n_steps, model.n_envs
+    checks.check_batch_size(*sizes, model.normalize_advantage)
     if model.desired_kl is not None:
         check_desired_kl(model.desired_kl, model.learning_rate)
 
@@ -309,9 +300,9 @@ def take_up_changes(model: Any) -> None:
     :raises ValueError: If a value cannot be used, or cannot change.
     """
     check_values(model)
+    check_cloned(model)
     note_changed_options(model)
-    for check in model.model_checks:
-        check(model)
+    check_model(model)
     model.rollout_buffer.gamma = model.gamma
     model.rollout_buffer.gae_lambda = model.gae_lambda
     model.read_learning_rate()

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
@@ -20,17 +19,23 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
-from sb3_policyflow.common.names import check_overridden_methods, own_options
+from sb3_policyflow.common.names import (
+    FormerAttribute,
+    WithoutLikelihood,
+    check_overridden_methods,
+    own_options,
+)
 from sb3_policyflow.common.options import accepts_former_names
 from sb3_policyflow.common.update import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
+from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
 from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
 
 NetArch = list[int] | dict[str, list[int]]
 
 
-class FlowPolicy(ActorCriticPolicy):
+class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
     """An actor-critic policy whose actor is a velocity field.
 
     ``forward`` returns actions, values and a record: a NamedTuple of tensors that says how the
@@ -55,9 +60,10 @@ class FlowPolicy(ActorCriticPolicy):
     :param embedding_dim: Size of the time and observation embeddings.
     :param frequencies: Frequencies of the time embedding, or how many to draw.
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
-    :param initialization: "glorot", "glorot_zero_output" or "zero".
-    :param random_latents: Whether ``predict(deterministic=True)`` draws the latents and leaves out
-        the noise only. May be set later.
+    :param initialization: "orthogonal", "glorot", "glorot_zero_output" or "zero".
+    :param deterministic_action: What ``predict(deterministic=True)`` returns: "mode", of the end
+        points of 32 fixed latents the one around which the others lie most densely; "zero", that of
+        z = 0, which may lie between modes; or "drawn", that of a random latent. May be set later.
     :raises ValueError: If an option is not supported.
     """
 
@@ -67,13 +73,14 @@ class FlowPolicy(ActorCriticPolicy):
         "frequencies",
         "frequency_scale",
         "initialization",
-        "random_latents",
+        "deterministic_action",
     )
     """Constructor arguments of all flow policies that SB3's ``save`` of a policy does not know."""
     default_features_extractor_class: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
     option_checks: ClassVar[Mapping[str, checks.Check]] = {
         "embedding_dim": checks.at_least(1),
         "initialization": checks.one_of(INITIALIZATIONS),
+        "deterministic_action": checks.one_of(("mode", "zero", "drawn")),
     }
 
     fixed_options: ClassVar[frozenset[str]] = frozenset()
@@ -81,8 +88,9 @@ class FlowPolicy(ActorCriticPolicy):
 
     velocity: VelocityField
     mlp_extractor: MlpExtractor
+    random_latents = FormerAttribute("deterministic_action")
 
-    @accepts_former_names(initialisation="initialization")
+    @accepts_former_names(initialisation="initialization", random_latents="deterministic_action")
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -101,16 +109,17 @@ class FlowPolicy(ActorCriticPolicy):
         embedding_dim: int = 64,
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
-        initialization: str = "glorot_zero_output",
-        random_latents: bool = False,
+        initialization: str = "orthogonal",
+        deterministic_action: str = "mode",
     ) -> None:
         checks.check_flow_spaces(action_space, use_sde)
+        checks.check_networks(net_arch, activation_fn, optimizer_class, features_extractor_class)
         check_overridden_methods(type(self), FlowPolicy)
         self.embedding_dim = embedding_dim
         self.frequencies = frequencies
         self.frequency_scale = frequency_scale
         self.initialization = initialization
-        self.random_latents = random_latents
+        self.deterministic_action = deterministic_action
         checks.check_options(self)
         features_extractor_class = features_extractor_class or self.default_features_extractor_class
         if net_arch is None and features_extractor_class is NatureCNN:
@@ -229,11 +238,22 @@ class FlowPolicy(ActorCriticPolicy):
             values = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
 
+    @property
+    @abstractmethod
+    def latent_scale(self) -> float | th.Tensor:
+        """Standard deviation of the latents: a number, or one for each dimension of the action."""
+
     def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
-        """Latents z ~ N(0, I), or 0 for the deterministic action, shape (n, action_dim)."""
-        draw = th.zeros if deterministic and not self.random_latents else th.randn
-        size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
-        return draw(size, device=features.device, dtype=features.dtype)
+        """Latents z ~ N(0, latent_scale^2) or the deterministic action's, shape (n, action_dim)."""
+        scale = self.latent_scale
+        is_zero = deterministic and self.deterministic_action == "zero"
+        if is_zero or (isinstance(scale, float) and scale == 0.0):
+            return features.new_zeros(features.shape[0], self.action_dim)
+        if not deterministic or self.deterministic_action == "drawn":
+            size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
+            return scale * th.randn(size, device=features.device, dtype=features.dtype)
+        candidates = scale * candidate_latents(self.action_dim).to(features)
+        return candidates[densest_endpoints(self.transport, candidates, features)]
 
     @property
     @abstractmethod
@@ -294,24 +314,6 @@ class FlowPolicy(ActorCriticPolicy):
 
     def keep_within_bounds(self) -> None:
         """Clamp parameters that have bounds, after a step of the optimizer."""
-
-    def get_distribution(self, obs: PyTorchObs) -> Distribution:  # noqa: ARG002
-        """Refuse: SB3's distributions say how likely actions are."""
-        raise self._no_likelihood()
-
-    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> Any:  # noqa: ARG002
-        """Refuse: the likelihood of an action under a flow policy has no closed form."""
-        raise self._no_likelihood()
-
-    def reset_noise(self, n_envs: int = 1) -> None:  # noqa: ARG002
-        """Refuse: this is gSDE's noise."""
-        raise TypeError(f"{type(self).__name__} does not support gSDE, whose noise this resets.")
-
-    def _no_likelihood(self) -> TypeError:
-        return TypeError(
-            f"{type(self).__name__} has no closed-form likelihood of actions: train it with the "
-            "flow algorithms of sb3_policyflow, which need none."
-        )
 
 
 FlowActorCriticPolicy = FlowPolicy

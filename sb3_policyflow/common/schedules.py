@@ -49,6 +49,15 @@ def parse_schedule(name: str, value: object) -> FloatSchedule:
     return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
 
 
+def positive_at_first(name: str, value: object) -> None:
+    """A coefficient as :func:`parse_schedule` takes it that is not zero at the start.
+
+    :raises ValueError: If it is.
+    """
+    if not callable(value) and parse_schedule(name, value)(1.0) == 0:
+        raise ValueError(f"{name} must be positive, got {value!r}: with 0 nothing could change.")
+
+
 @dataclass(frozen=True)
 class KLAdaptiveLearningRate:
     """Lowers the learning rate when the policy changes too much and raises it when too little.

@@ -2,14 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
-from sb3_policyflow.common.losses import SURROGATES
-from sb3_policyflow.kernels import clip_gradients_in_place
+from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
+from sb3_policyflow.kernels import clip_gradients_in_place, step_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -26,6 +26,32 @@ class PolicyTerms(NamedTuple):
     metrics: dict[str, th.Tensor]
 
 
+class Loss(Protocol):
+    """What a step of the optimizer needs of a loss: a tensor is one."""
+
+    def item(self) -> float:
+        """Its value."""
+
+    def backward(self, *, inputs: Any = None) -> None:
+        """Add its gradients to those of the parameters; of ``inputs`` only, if they are given."""
+
+
+class CompiledTerms(NamedTuple):
+    """A minibatch's loss and divergence, see :class:`PolicyTerms`, and what is to be logged.
+
+    Means over the minibatches are logged of ``means``, and the greatest of ``maxima``.
+    """
+
+    loss: Loss
+    kl: th.Tensor
+    means: dict[str, float]
+    maxima: dict[str, float]
+
+
+CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], CompiledTerms | None]
+"""Takes a minibatch, and the features of actor and critic; None where kernels cannot work."""
+
+
 class FlowUpdate(ABC):
     """An algorithm's part of the update of one rollout.
 
@@ -35,7 +61,8 @@ class FlowUpdate(ABC):
     ``clip_range`` is epsilon, one number or of a shape that broadcasts with a log ratio (n, ...).
     Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
     ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
-    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout.
+    None for 1. If ``trains_actor`` is False, only the critic learns from the rollout. If there is a
+    ``compiled_loss``, it takes the place of the formulas in :meth:`loss` where it can.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
@@ -43,12 +70,20 @@ class FlowUpdate(ABC):
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
-        self.batch_size: int = algorithm.batch_size
+        self.policy: Any = algorithm.policy
+        self.vf_coef: float = algorithm.vf_coef
+        bounds_values = algorithm.clip_range_vf is not None
+        self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
+        self.compiled_loss: CompiledLoss | None = None
+        self.batch_size: int = algorithm.ranks.share("batch_size", algorithm.batch_size)
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
-        self.trains_actor = True
+        self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
+        self.pull: ImitationPull | None = None
+        if (coef := algorithm.value_of("imitation_coef")) > 0:
+            self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)
 
     @abstractmethod
     def draw(self) -> tuple[th.Tensor, ...]:
@@ -61,6 +96,36 @@ class FlowUpdate(ABC):
         :param batch: A minibatch of n samples, with what was drawn for them.
         :param features: The actor's features, shape (n, features_dim).
         """
+
+    def loss(
+        self, batch: FlowRolloutBufferSamples, metrics: "UpdateMetrics"
+    ) -> tuple[Loss, th.Tensor]:
+        """The loss of a minibatch (paper, algorithm 1, lines 18 to 21).
+
+        :param batch: n samples, with what was drawn for them.
+        :param metrics: Takes what is to be logged.
+        :return: The loss, and the divergence from the reference policy, without dimensions.
+        """
+        features, critic_features = self.policy.actor_critic_features(batch.observations)
+        if self.compiled_loss is not None and self.pull is None:
+            compiled = self.compiled_loss(batch, features, critic_features)
+            if compiled is not None:
+                metrics.add_means(compiled.means)
+                metrics.add_maxima(compiled.maxima)
+                return compiled.loss, compiled.kl
+        terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
+        if self.pull is not None:
+            pull = self.pull.loss(batch, features)
+            terms = terms._replace(
+                regularizer=terms.regularizer + self.pull.coef * pull,
+                metrics={**terms.metrics, "imitation_loss": pull},
+            )
+        policy_loss = self.surrogate_loss(terms.log_ratio, batch.advantages, metrics)  # line 19
+        # Squared error of the values against the TD(lambda) returns
+        values = self.policy.values(critic_features).flatten()
+        value_loss = clipped_value_loss(values, batch.old_values, batch.returns, self.clip_range_vf)
+        metrics.add_means({"value_loss": value_loss, **terms.metrics})
+        return policy_loss + terms.regularizer + self.vf_coef * value_loss, terms.kl.detach()
 
     def surrogate_loss(
         self, log_ratio: th.Tensor, advantages: th.Tensor, metrics: "UpdateMetrics"
@@ -104,33 +169,40 @@ class UpdateMetrics:
     """
 
     def __init__(self) -> None:
-        self._to_average: dict[str, list[th.Tensor]] = {}
-        self._to_maximize: dict[str, list[th.Tensor]] = {}
+        self._to_average: dict[str, list[Any]] = {}
+        self._to_maximize: dict[str, list[Any]] = {}
 
-    def add_means(self, metrics: Mapping[str, th.Tensor]) -> None:
-        """Add metrics of one minibatch, tensors without dimensions, that are averaged."""
+    def add_means(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
+        """Add metrics of one minibatch, tensors without dimensions or numbers, to be averaged."""
         for name, value in metrics.items():
             self._append(self._to_average.setdefault(name, []), value)
 
-    def add_maxima(self, metrics: Mapping[str, th.Tensor]) -> None:
+    def add_maxima(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
         """Add metrics of one minibatch of which the greatest counts."""
         for name, value in metrics.items():
             self._append(self._to_maximize.setdefault(name, []), value)
 
     @staticmethod
-    def _append(values: list[th.Tensor], value: th.Tensor) -> None:
-        values.append(value.detach())
-        if len(values) == 32:
+    def _append(values: list[Any], value: th.Tensor | float) -> None:
+        values.append(value.detach() if isinstance(value, th.Tensor) else value)
+        if len(values) == 32 and isinstance(value, th.Tensor):
             # Many small tensors would keep the memory between them from being used again.
-            values[:] = [th.hstack(values)]
+            values[:] = [_joined(values)]
 
     def summary(self) -> dict[str, float]:
         """Each metric over all minibatches."""
-        reduced = {name: th.hstack(values).mean() for name, values in self._to_average.items()}
-        reduced |= {name: th.hstack(values).max() for name, values in self._to_maximize.items()}
+        reduced = {name: _joined(values).mean() for name, values in self._to_average.items()}
+        reduced |= {name: _joined(values).max() for name, values in self._to_maximize.items()}
         if not reduced:
             return {}
         return dict(zip(reduced, th.stack(list(reduced.values())).tolist(), strict=True))
+
+
+def _joined(values: list[Any]) -> th.Tensor:
+    """Tensors and numbers as one tensor."""
+    numbers = [value for value in values if not isinstance(value, th.Tensor)]
+    tensors = [value for value in values if isinstance(value, th.Tensor)]
+    return th.hstack([*tensors, th.tensor(numbers)] if numbers else tensors)
 
 
 def make_optimizer(
@@ -181,6 +253,12 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None
     return norm
 
 
+def take_step(optimizer: th.optim.Optimizer) -> None:
+    """Take a step of an optimizer, in one call of a kernel if it is plain Adam on a CPU."""
+    if not step_in_place(optimizer):
+        optimizer.step()
+
+
 def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> None:
     """Refuse a step of the optimizer that would spoil the parameters.
 
@@ -197,3 +275,33 @@ def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> Non
         f"The {what} is not finite (loss {loss}, {num_timesteps} timesteps). The parameters are "
         f"those of the last good step and can be saved: lower the learning rate{advice}."
     )
+
+
+def check_model(model: Any) -> None:
+    """Refuse options that do not go together with each other or with the policy that was made.
+
+    :param model: An algorithm that has its policy.
+    :raises TypeError: If a critic is to be trained alone that cannot be told from the actor.
+    """
+    networks = model.policy.mlp_extractor
+    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+        raise TypeError(
+            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
+            "stable_baselines3.common.torch_layers.MlpExtractor."
+        )
+    for check in model.model_checks:
+        check(model)
+
+
+def check_cloned(model: Any) -> None:
+    """Refuse a pull towards a policy that does not exist.
+
+    :raises ValueError: If the model was not cloned from demonstrations.
+    """
+    if model.imitation_coef != 0 and model.cloned_parameters is None:
+        raise ValueError(
+            f"imitation_coef={model.imitation_coef!r} pulls towards a policy that was cloned from "
+            "demonstrations, and this model was not: call sb3_policyflow.imitation.clone first, or "
+            "leave it out."
+        )

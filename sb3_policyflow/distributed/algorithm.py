@@ -3,7 +3,7 @@
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any, ClassVar
+from typing import Any
 
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,9 +24,13 @@ class DistributedOnPolicyAlgorithm(DeviceOnPolicyAlgorithm):
     on the others.
     """
 
-    progress_attributes: ClassVar[tuple[str, ...]] = ()
-    """What a run counts besides SB3's counters, its parameters and its optimizer."""
-    unsaved = (*DeviceOnPolicyAlgorithm.unsaved, "ranks", "_shared_training")
+    unsaved = (
+        *DeviceOnPolicyAlgorithm.unsaved,
+        "rank",
+        "ranks",
+        "other_resume_states",
+        "_shared_training",
+    )
     ranks: Ranks = Alone()
     """The processes that train this model."""
     run_id: str = ""

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from torch import distributed as dist
 from torch.distributed.distributed_c10d import PrefixStore
@@ -125,16 +126,13 @@ class ProcessGroup(Ranks):
         total = squares.sum() + len(values) * (means - mean).square().sum()
         return mean, (total / (self.size * len(values) - 1)).sqrt()
 
-    def average_gradients(
-        self, parameters: Iterable[th.nn.Parameter], loss: th.Tensor
-    ) -> th.Tensor:
+    def average_gradients(self, parameters: Iterable[th.nn.Parameter], loss: float) -> float:
         gradients = [p.grad for p in parameters if p.grad is not None]
-        losses = loss.new_zeros(self.size)
-        losses[self.rank] = loss.detach()
-        flat = th.cat([*(gradient.reshape(-1) for gradient in gradients), losses])
-        self._sum(flat)
-        losses = flat[-self.size :]
-        for rank, one in enumerate(losses.tolist()):
+        own_loss = gradients[0].new_zeros(self.size)
+        own_loss[self.rank] = loss
+        flat = self._sum(th.cat([*(gradient.reshape(-1) for gradient in gradients), own_loss]))
+        losses = flat[-self.size :].tolist()
+        for rank, one in enumerate(losses):
             if not math.isfinite(one):
                 raise FloatingPointError(
                     f"The loss of rank {rank} is not finite (loss {one}). The parameters are "
@@ -143,7 +141,7 @@ class ProcessGroup(Ranks):
         flat /= self.size
         parts = th.split(flat, [gradient.numel() for gradient in gradients] + [self.size])
         th._foreach_copy_(gradients, [p.view_as(g) for p, g in zip(parts, gradients, strict=False)])
-        return parts[-1].sum()
+        return float(np.mean(losses))
 
     def average_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:
         rows = self._table(th.tensor(list(metrics.values()), dtype=th.float64, device="cpu"))

@@ -42,6 +42,16 @@ class Ranks(ABC):
             )
         return total // self.size
 
+    def normalized(self, values: th.Tensor) -> th.Tensor:
+        """Values with mean 0 and standard deviation 1 over all ranks; a single one as it is.
+
+        :param values: This rank's, shape (n,).
+        """
+        if self.size * len(values) < 2:
+            return values
+        mean, std = self.mean_std(values)
+        return (values - mean) / (std + 1e-8)
+
     @abstractmethod
     def mean(self, value: th.Tensor) -> float:
         """The mean over the ranks of a tensor without dimensions."""
@@ -54,9 +64,7 @@ class Ranks(ABC):
         """
 
     @abstractmethod
-    def average_gradients(
-        self, parameters: Iterable[th.nn.Parameter], loss: th.Tensor
-    ) -> th.Tensor:
+    def average_gradients(self, parameters: Iterable[th.nn.Parameter], loss: float) -> float:
         """Replace gradients by their means over the ranks.
 
         :param parameters: Those whose gradients are averaged, where they have one.
@@ -85,8 +93,8 @@ class Alone(Ranks):
     def average_gradients(
         self,
         parameters: Iterable[th.nn.Parameter],  # noqa: ARG002
-        loss: th.Tensor,
-    ) -> th.Tensor:
+        loss: float,
+    ) -> float:
         return loss
 
     def average_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:

@@ -33,12 +33,15 @@ def run_id() -> str:
     return f"{name}-{socket.gethostname()}-{parent}-{started}"
 
 
-def counters(model: Any) -> tuple[str, ...]:
-    """The attributes with which a run counts what it has done.
+def counters(model: Any) -> list[str]:
+    """The attributes that say what a run has done, besides parameters and optimizer.
 
     :param model: The model.
     """
-    return ("num_timesteps", "_n_updates", "_episode_num", *model.progress_attributes)
+    names = ("num_timesteps", "_n_updates", "_episode_num", "n_rollouts", "adaptive_learning_rate")
+    return [
+        name for name in (*names, "_adaptive_start", "cloned_parameters") if hasattr(model, name)
+    ]
 
 
 def take_up(model: Any, group: ProcessGroup, callback: BaseCallback) -> bool:

@@ -34,10 +34,10 @@ class DPPOUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: DPPOPolicy
+
     def __init__(self, algorithm: "DPPO", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
-        self.policy = algorithm.policy
-        self.trains_actor = algorithm.n_rollouts >= algorithm.n_critic_warmup
         self.log_prob_clamp = algorithm.log_prob_clamp
         self.log_prob_reduction = algorithm.log_prob_reduction
         n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
@@ -86,20 +86,6 @@ class DPPOUpdate(FlowUpdate):
         return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)
 
 
-def check_warmup(model: Any) -> None:
-    """Refuse to train a critic alone that cannot be told from the actor.
-
-    :raises TypeError: If the policy has networks of the user's own without a ``value_net``.
-    """
-    networks = model.policy.mlp_extractor
-    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
-        raise TypeError(
-            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
-            f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
-            "stable_baselines3.common.torch_layers.MlpExtractor."
-        )
-
-
 class DPPO(FlowOnPolicyAlgorithm):
     """On-policy learning with diffusion policies.
 
@@ -121,7 +107,6 @@ class DPPO(FlowOnPolicyAlgorithm):
     :param clip_range_base: Clip range of the first trained step, from which that of the others
         rises to ``clip_range`` exponentially; None for the same in each.
     :param clip_range_rate: Rate of this exponential.
-    :param n_critic_warmup: Rollouts at the start from which only the critic learns.
     :param n_entropy_actions: Actions drawn in a state for the entropy that ``ent_coef`` weighs.
     :param n_entropy_states: States of a minibatch in which they are drawn, at most.
     :raises ValueError: If an argument cannot be used.
@@ -140,11 +125,9 @@ class DPPO(FlowOnPolicyAlgorithm):
         "denoising_gamma": checks.positive_up_to(1.0),
         "clip_range_base": checks.positive_or_none,
         "clip_range_rate": checks.positive,
-        "n_critic_warmup": checks.at_least(0),
         "n_entropy_actions": checks.at_least(2),
         "n_entropy_states": checks.at_least(1),
     }
-    model_checks = (check_warmup,)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(
@@ -157,7 +140,6 @@ class DPPO(FlowOnPolicyAlgorithm):
         denoising_gamma: float = 0.99,
         clip_range_base: float | None = None,
         clip_range_rate: float = 3.0,
-        n_critic_warmup: int = 0,
         n_entropy_actions: int = 8,
         n_entropy_states: int = 256,
         **options: Unpack[DPPOOptions],
@@ -167,7 +149,6 @@ class DPPO(FlowOnPolicyAlgorithm):
         self.denoising_gamma = denoising_gamma
         self.clip_range_base = clip_range_base
         self.clip_range_rate = clip_range_rate
-        self.n_critic_warmup = n_critic_warmup
         self.n_entropy_actions = n_entropy_actions
         self.n_entropy_states = n_entropy_states
         super().__init__(policy, env, *args, **options)

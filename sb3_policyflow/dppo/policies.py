@@ -15,6 +15,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.flows import MatchingSamples
+from sb3_policyflow.flows.bounds import SHORTEST_MEANINGLESS
 from sb3_policyflow.flows.denoising import DDPM, DenoisingProcess, EulerChain, Steps
 
 
@@ -42,9 +44,6 @@ class DPPORecord(NamedTuple):
     means: th.Tensor
 
 
-SHORTEST_MEANINGLESS = 200.0
-"""Distance of two bounds from which they seem to stand for none. IsaacLab gives -100 and 100 then,
-others 1e3, 1e10 or the largest number; in the tasks of Gymnasium they are at most 6 apart."""
 ADVICE = (
     "use process='flow', which does not scale, or give the environment bounds that mean something "
     "(gymnasium.wrappers.TransformAction)"
@@ -171,6 +170,10 @@ class DPPOPolicy(FlowPolicy):
                 self.base_mlp_extractor = deepcopy(self.mlp_extractor).requires_grad_(False)
 
     @property
+    def latent_scale(self) -> float:
+        return 1.0
+
+    @property
     def n_evaluations_per_action(self) -> int:
         return self.n_denoising_steps
 
@@ -247,10 +250,14 @@ class DPPOPolicy(FlowPolicy):
             features = base if is_frozen else trained
         return self.chain.means(points, network(points, self.chain.times[steps], features), steps)
 
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where denoising is trained on the way to end points of the chain (n, dim)."""
+        return self.chain.draw_matching(endpoints)
+
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, DPPORecord]:
-        """Draw actions; the deterministic one starts at 0 and each step goes to its mean."""
+        """Draw actions; in deterministic ones each step goes to its mean."""
         latents = self.draw_latents(features, deterministic)
         points, means = self._chain(latents, features, is_noisy=not deterministic)
         record = DPPORecord(

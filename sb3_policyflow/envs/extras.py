@@ -4,20 +4,7 @@ import importlib
 
 from gymnasium.error import DependencyNotInstalled
 
-
-def install_command(extra: str, upgrade: bool = False) -> str:
-    """The command that installs an extra of this package, for hints in error messages.
-
-    It is for a checkout, because no package index has this package.
-
-    :param extra: Name of the extra.
-    :param upgrade: Whether to upgrade all that the extra brings.
-
-    >>> install_command("robotics")
-    'run `pip install ".[robotics]"` in the checkout of sb3-policyflow'
-    """
-    options = "--upgrade --upgrade-strategy eager " if upgrade else ""
-    return f'run `pip install {options}".[{extra}]"` in the checkout of sb3-policyflow'
+from sb3_policyflow.hints import install_command
 
 
 def import_extra(module: str, extra: str, env_id: str) -> None:
@@ -34,7 +21,7 @@ def import_extra(module: str, extra: str, env_id: str) -> None:
     except ModuleNotFoundError as error:
         if error.name != module:
             raise _broken(module, extra, env_id, error) from error
-        message = f"{env_id} needs {module}: {install_command(extra)}"
+        message = f"{env_id} needs {module}: run `{install_command(extra)}`"
         raise DependencyNotInstalled(message) from error
     # A package may raise anything if the versions of its dependencies do not suit it.
     except Exception as error:
@@ -45,5 +32,6 @@ def _broken(module: str, extra: str, env_id: str, error: Exception) -> Dependenc
     first_line = next(iter(str(error).splitlines()), "")
     return DependencyNotInstalled(
         f"{env_id} needs {module}, which does not work with the packages installed here "
-        f"({type(error).__name__}: {first_line}): {install_command(extra, upgrade=True)}"
+        f"({type(error).__name__}: {first_line}): run "
+        f"`{install_command(extra, upgrade=True)}`"
     )

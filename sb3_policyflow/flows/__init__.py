@@ -14,6 +14,7 @@ from sb3_policyflow.flows.interpolants import (
     StochasticInterpolant,
     TrigFlow,
 )
+from sb3_policyflow.flows.matching import MatchingSamples, draw_matching
 from sb3_policyflow.flows.solvers import SOLVERS, Solver, integrate
 from sb3_policyflow.flows.times import (
     TIME_SAMPLERS,
@@ -41,6 +42,7 @@ __all__ = [
     "GridTimes",
     "GridTimesWithoutEnd",
     "Interpolant",
+    "MatchingSamples",
     "Path",
     "Rectified",
     "Solver",
@@ -50,5 +52,6 @@ __all__ = [
     "TrigFlow",
     "UniformTimes",
     "VelocityField",
+    "draw_matching",
     "integrate",
 ]

@@ -9,6 +9,9 @@ from abc import abstractmethod
 import torch as th
 from torch import nn
 
+from sb3_policyflow.flows.interpolants import Rectified
+from sb3_policyflow.flows.matching import MatchingSamples
+
 Steps = int | slice
 """One step, or several along the last but one axis of the points."""
 
@@ -42,6 +45,16 @@ class DenoisingProcess(nn.Module):
         :param steps: k.
         :return: m_k, of the same shape.
         """
+
+    @abstractmethod
+    def draw_matching(self, data: th.Tensor) -> MatchingSamples:
+        """Draw a step for each of some data, a point where it starts, and what is wanted there.
+
+        :param data: x_K, shape (n, dim).
+        """
+
+    def _draw_steps(self, data: th.Tensor) -> th.Tensor:
+        return th.randint(self.n_steps, (len(data),), device=data.device)
 
 
 class DDPM(DenoisingProcess):
@@ -81,7 +94,18 @@ class DDPM(DenoisingProcess):
         data = data.clamp(-self.data_clip, self.data_clip)
         return self._at("_data_to_mean", steps) * data + self._at("_point_to_mean", steps) * points
 
-    def _at(self, name: str, steps: Steps) -> th.Tensor:
+    def draw_matching(self, data: th.Tensor) -> MatchingSamples:
+        """Noisy data x_k = sqrt(abar_k) data + sqrt(1 - abar_k) eps; the network is to say eps."""
+        steps, noise = self._draw_steps(data), th.randn_like(data)
+        to_data = self._at("_noise_to_data", steps)
+        points = (data + to_data * noise) / self._at("_point_to_data", steps)
+        targets = noise - points if self.identity_skip else noise
+        times = self.times[steps]
+        # K steps of a velocity v move a point by v; a change of eps moves K means.
+        gains = self.n_steps * (self._at("_data_to_mean", steps) * to_data).squeeze(-1)
+        return MatchingSamples(times, points, targets, th.ones_like(times), gains)
+
+    def _at(self, name: str, steps: Steps | th.Tensor) -> th.Tensor:
         coefficients: th.Tensor = getattr(self, name)
         return coefficients[steps].unsqueeze(-1)
 
@@ -99,6 +123,13 @@ class EulerChain(DenoisingProcess):
     def means(self, points: th.Tensor, outputs: th.Tensor, steps: Steps) -> th.Tensor:  # noqa: ARG002
         """One Euler step from each point, see :meth:`DenoisingProcess.means`."""
         return points + outputs / self.n_steps
+
+    def draw_matching(self, data: th.Tensor) -> MatchingSamples:
+        """Flow matching along straight lines, at the times at which steps start."""
+        times, noise = self.times[self._draw_steps(data)], th.randn_like(data)
+        points = Rectified().interpolate(noise, data, times)
+        ones = th.ones_like(times)
+        return MatchingSamples(times, points, data - noise, ones, ones)
 
 
 def cosine_alpha_bar(n_steps: int, offset: float = 0.008, largest_beta: float = 0.999) -> th.Tensor:

@@ -82,7 +82,7 @@ class Interpolant(ABC):
         reference_velocity: th.Tensor,
         points: th.Tensor,
         times: th.Tensor,
-        latent_std: float = 1.0,
+        latent_std: float | th.Tensor = 1.0,
     ) -> th.Tensor:
         """How far a velocity is from minus the score of the reference flow (paper, eta_t).
 
@@ -101,7 +101,8 @@ class Interpolant(ABC):
             shape (..., dim).
         :param points: x_t, shape (..., dim).
         :param times: t, shape (...).
-        :param latent_std: s, of z ~ N(0, s^2); 1 for stochastic interpolants.
+        :param latent_std: s, of z ~ N(0, s^2), a number or shape (dim,); 1 for stochastic
+            interpolants.
         :return: eta, shape (..., dim).
         """
         score, velocity_coef, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))

@@ -4,8 +4,9 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from numbers import Integral
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -93,8 +94,10 @@ class VelocityField(nn.Module):
     :param embedding_dim: Size of the time and observation embeddings.
     :param frequencies: See :class:`FourierTimeEmbedding`.
     :param frequency_scale: See :class:`FourierTimeEmbedding`.
-    :param initialization: "glorot", "glorot_zero_output" or "zero" (paper, sensitivity to network
-        initialization). With "zero" only the output's bias ever learns if the activation of 0 is 0.
+    :param initialization: "orthogonal", whose layers keep variances, or one of the paper's,
+        "glorot", "glorot_zero_output" and "zero" (paper, sensitivity to network initialization).
+        The velocity is zero at the start but for "glorot". With "zero" only the output's bias ever
+        learns if the activation of 0 is 0.
     :raises ValueError: If the initialization is unknown or the embedding is empty.
     """
 
@@ -115,7 +118,7 @@ class VelocityField(nn.Module):
         embedding_dim: int = 64,
         frequencies: int | Sequence[float] | None = None,
         frequency_scale: float = 1.0,
-        initialization: str = "glorot_zero_output",
+        initialization: str = "orthogonal",
     ) -> None:
         super().__init__()
         if embedding_dim < 1:
@@ -216,7 +219,53 @@ def _zero(field: VelocityField) -> None:
             nn.init.zeros_(parameter)
 
 
+def _orthogonal(field: VelocityField) -> None:
+    """Orthogonal layers that keep variances, and an output layer of zeros.
+
+    Observations of variance 1 are embedded with variance 1, whatever their number, and every hidden
+    layer keeps the variance under the activation that there is. Time enters with less, so that the
+    velocity begins as a function of the observation rather than of random features of time.
+    """
+    time_hidden, activation, time_output = field.time_embedding.mlp
+    _fill_orthogonal(time_hidden, 2**0.5)  # cosines and sines have a mean square of 1/2
+    _fill_orthogonal(time_output, TIME_STD * _gain(activation))
+    _fill_orthogonal(field.observation_embedding, 1.0)
+    gain = 1.0
+    for layer in field.hidden:
+        if isinstance(layer, nn.Linear):
+            _fill_orthogonal(layer, gain)
+        else:
+            gain = _gain(layer)
+    nn.init.zeros_(field.output.weight)
+    nn.init.zeros_(field.output.bias)
+
+
+TIME_STD = 0.3
+"""Standard deviation of the time embedding where that of the observation embedding is 1."""
+
+
+def _fill_orthogonal(layer: Any, gain: float) -> None:
+    """A linear layer with orthogonal weights, which multiply the standard deviation by a gain."""
+    n_out, n_in = layer.weight.shape
+    nn.init.orthogonal_(layer.weight, gain * max(1.0, n_out / n_in) ** 0.5)
+    nn.init.zeros_(layer.bias)
+
+
+def _gain(activation: nn.Module) -> float:
+    """1 / sqrt(E[f(x)^2]) for x ~ N(0, 1), which keeps the variance behind an activation f.
+
+    >>> round(_gain(nn.ReLU()), 6), round(_gain(nn.Identity()), 6)
+    (1.414214, 1.0)
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(80)
+    with th.no_grad():
+        values = activation(th.as_tensor(nodes, dtype=th.float32, device="cpu")).double().numpy()
+    mean_square = float((weights * values**2).sum() / weights.sum())
+    return 1 / math.sqrt(mean_square)
+
+
 INITIALIZATIONS: dict[str, Callable[[VelocityField], None]] = {
+    "orthogonal": _orthogonal,
     "glorot": _glorot,
     "glorot_zero_output": _glorot_zero_output,
     "zero": _zero,

@@ -49,9 +49,11 @@ class FPOUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: FPOPolicy
+
     def __init__(self, algorithm: "FPO", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
-        self.policy = policy = algorithm.policy
+        policy = algorithm.policy
         self.algorithm = algorithm
         n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
         self.entropy_bonus = EntropyBonus(

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.flows import SOLVERS, Flow, Rectified
+from sb3_policyflow.flows import SOLVERS, Flow, MatchingSamples, Rectified, draw_matching
 
 
 class FPOOptions(FlowOptions, total=False):
@@ -70,6 +70,10 @@ class FPOPolicy(FlowPolicy):
         return Flow(self.velocity, Rectified(), self.solver, self.n_flow_steps)
 
     @property
+    def latent_scale(self) -> float:
+        return 1.0
+
+    @property
     def n_evaluations_per_action(self) -> int:
         return self.flow.n_evaluations
 
@@ -77,10 +81,14 @@ class FPOPolicy(FlowPolicy):
         """End points of the flow, see :meth:`FlowPolicy.transport`."""
         return self.flow.solve(latents, features)
 
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
+        return draw_matching(self.flow.interpolant, endpoints)
+
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, NoRecord]:
-        """Draw actions; the deterministic one has z = 0 and no noise (FPO++: zero-sampling)."""
+        """Draw actions; deterministic ones have no noise (FPO++: with "zero", zero-sampling)."""
         actions = self.transport(self.draw_latents(features, deterministic), features)
         if self.action_noise_std > 0 and not deterministic:
             actions = actions + self.action_noise_std * th.randn_like(actions)

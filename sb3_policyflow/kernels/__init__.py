@@ -22,17 +22,25 @@ acting, gradients of actor and critic          0.85 (0.63)  1.37 (1.15)         
 from typing import Any
 
 from sb3_policyflow.flows import VelocityField
-from sb3_policyflow.kernels.critic import KernelCritic, reason_kernels_are_off
+from sb3_policyflow.kernels.critic import KernelCritic
 from sb3_policyflow.kernels.fields import KernelVelocityField
-from sb3_policyflow.kernels.gradients import clip_gradients_in_place
+from sb3_policyflow.kernels.gradients import clip_gradients_in_place, step_in_place
 from sb3_policyflow.kernels.inspection import has_values
+from sb3_policyflow.kernels.layouts import LossOptions
+from sb3_policyflow.kernels.losses import KernelLoss, LossInputs
+from sb3_policyflow.kernels.policies import reason_kernels_are_off, shares_cores
 
 __all__ = [
     "KernelCritic",
+    "KernelLoss",
+    "LossInputs",
+    "LossOptions",
     "clip_gradients_in_place",
     "has_values",
     "make_velocity_field",
     "reason_kernels_are_off",
+    "shares_cores",
+    "step_in_place",
 ]
 
 

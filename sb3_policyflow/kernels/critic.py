@@ -5,13 +5,12 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.torch_layers import MlpExtractor
 
-from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.inspection import KernelView, ModuleInspector, UnsupportedError
 from sb3_policyflow.kernels.layouts import Kernels
 from sb3_policyflow.kernels.mlp import MLP, evaluate_mlp, read_mlp
 
 
-def _read_critic(kernels: Kernels, inspector: ModuleInspector, policy: Any) -> MLP:
+def read_critic(kernels: Kernels, inspector: ModuleInspector, policy: Any) -> MLP:
     """Read the critic behind the features, or raise :class:`UnsupportedError`."""
     inspector.children(policy)
     extractor = policy.mlp_extractor
@@ -30,7 +29,7 @@ class KernelCritic:
     """
 
     def __init__(self) -> None:
-        self._view = KernelView(_read_critic)
+        self._view = KernelView(read_critic)
 
     def __call__(self, policy: Any, features: th.Tensor) -> th.Tensor | None:
         """Estimate values.
@@ -41,18 +40,3 @@ class KernelCritic:
         """
         network = self._view.of(policy)
         return None if isinstance(network, str) else evaluate_mlp(network, features)
-
-
-def reason_kernels_are_off(policy: Any) -> str | None:
-    """Why kernels work on a policy's networks only in part or not at all.
-
-    :param policy: A policy whose ``velocity`` :func:`make_velocity_field` made, with SB3's critic.
-    :return: A part of a sentence; None if they work on actor and critic.
-    """
-    if not isinstance(policy.velocity, KernelVelocityField):
-        return f"{type(policy.velocity).__name__} is not a velocity field of kernels"
-    actor = policy.velocity.parts()
-    if isinstance(actor, str):
-        return actor
-    critic = KernelView(_read_critic).of(policy)
-    return f"for the critic, {critic}" if isinstance(critic, str) else None

@@ -17,7 +17,6 @@ from sb3_policyflow.kernels.inspection import (
     are_usable,
 )
 from sb3_policyflow.kernels.layouts import (
-    FieldGradients,
     FieldLayout,
     FirstLayer,
     Floats,
@@ -27,10 +26,10 @@ from sb3_policyflow.kernels.layouts import (
 from sb3_policyflow.kernels.mlp import (
     MLP,
     Evaluation,
-    Gradients,
     any_needs_grad,
     differentiable_gradients,
     read_mlp,
+    views_like,
 )
 
 
@@ -55,7 +54,9 @@ class FieldParts:
         self.features_dim = observation.weight.shape[1]
         # In the order of FieldLayout and of named_parameters.
         self.embedding = [*time.tensors, *observation, *network.layers[0]]
+        self.n_embedding = sum(tensor.numel() for tensor in self.embedding)
         self.parameters = [*self.embedding, *network.tensors[2:]]
+        self.n_parameters = sum(tensor.numel() for tensor in self.parameters)
         self.tensors = [frequencies, *self.parameters]
         embedding = [*time.held, *(tensor.detach() for tensor in observation), *network.held[:2]]
         self.held = [frequencies.detach(), *embedding, *network.held[2:]]
@@ -150,71 +151,61 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
         )
 
 
-class _Embedding:
-    """What time and observation contribute to a field's first layer, forward and backward.
+class Embedding:
+    """A field up to its first layer, forward and backward.
 
     :param parts: The field.
     :param times: shape (...).
-    :param features: shape (m, features_dim).
     """
 
-    def __init__(self, parts: FieldParts, times: Floats, features: Floats) -> None:
-        self._parts, self._features = parts, features
+    def __init__(self, parts: FieldParts, times: Floats) -> None:
+        self._parts = parts
         distinct = times.reshape(-1).copy()
         n_times, size, width = times.size, parts.time.n_outputs, parts.network.widths[0]
         self._first = FirstLayer(
+            np.empty((parts.dim + parts.features_dim, width), dtype=np.float32),
             np.empty((n_times, width), dtype=np.float32),
             np.empty(n_times, dtype=np.int64),
-            np.empty((len(features), width), dtype=np.float32),
+            np.empty((n_times, parts.time.n_inputs), dtype=np.float32),
             *np.empty((3, n_times, size), dtype=np.float32),
         )
-        n_distinct = parts.kernels.embed(distinct, features, parts.layout, self._first)
-        self._times = distinct[:n_distinct]
+        n_distinct = parts.kernels.embed(distinct, parts.layout, self._first)
+        self.times = distinct[:n_distinct]
+        """The distinct times, shape (n_distinct,)."""
 
-    def kernel_input(self, points: Floats, times_shape: th.Size, leading: th.Size) -> KernelInput:
-        """The first layer of a network that sees points, too.
+    def kernel_input(
+        self, points: Floats, features: Floats, times_shape: th.Size, leading: th.Size
+    ) -> KernelInput:
+        """The first layer of the field's network.
 
         :param points: shape (n, dim).
+        :param features: shape (m, features_dim).
         :param times_shape: The shape that the times have.
         :param leading: The shape that the n points have, with which it broadcasts.
         """
-        table, entries, shifts = self._first[:3]
+        weights, table, entries = self._first[:3]
         if times_shape != leading:
             # A copy: numba would compile the kernels again for a view that is not contiguous.
             entries = np.broadcast_to(entries.reshape(times_shape), leading).flatten()
-        stride = self._parts.network.n_inputs
-        return KernelInput(points, stride, table[: len(self._times)], entries, shifts)
+        return KernelInput(points, features, weights, table[: len(self.times)], entries)
 
-    def backward(self, gradients: Gradients, grad_features: Floats) -> list[th.Tensor]:
+    def backward(self, grad_first: Floats, grads: Floats) -> None:
         """Gradients of the parameters up to the first layer.
 
-        :param gradients: Those of the network.
-        :param grad_features: Filled; shape (m, features_dim), or empty if it is not wanted.
+        :param grad_first: Those of the first layer's weights and table, flat.
+        :param grads: Filled with those of the ``embedding`` of the parts, flat.
         """
-        arrays = [np.empty(tensor.shape, dtype=np.float32) for tensor in self._parts.embedding]
-        self._parts.kernels.embed_backward(
-            self._times,
-            self._features,
-            self._parts.layout,
-            self._first,
-            FieldGradients(
-                gradients.points.numpy(),
-                gradients.table.numpy(),
-                gradients.shifts,
-                grad_features,
-                *arrays,
-            ),
-        )
-        return [th.from_numpy(array) for array in arrays]
+        self._parts.kernels.embed_backward(self._parts.layout, self._first, grad_first, grads)
 
 
 def _evaluation(
     parts: FieldParts, times: th.Tensor, points: th.Tensor, features: th.Tensor
-) -> tuple[_Embedding, Evaluation]:
+) -> tuple[Embedding, Evaluation]:
     flat_points = points.detach().view(-1, parts.dim).numpy()
     flat_features = features.detach().view(-1, parts.features_dim).numpy()
-    embedding = _Embedding(parts, times.numpy(), flat_features)
-    first = embedding.kernel_input(flat_points, times.shape, points.shape[:-1])
+    embedding = Embedding(parts, times.numpy())
+    leading = points.shape[:-1]
+    first = embedding.kernel_input(flat_points, flat_features, times.shape, leading)
     return embedding, Evaluation(parts.network, first)
 
 
@@ -252,23 +243,23 @@ class _FieldEvaluation(th.autograd.Function):
         grad_points = th.empty_like(points if needs_points else points[:0])
         grad_features = th.empty_like(features if needs_features else features[:0])
         n_embedding, parts = len(ctx.parts.embedding), ctx.parts
-        gradients = ctx.evaluation.backward(
+        of_first, others = ctx.evaluation.backward(
             saved,
             parameters[n_embedding - 2 :],
             grad_outputs.reshape(-1, parts.dim),
             grad_points.view(-1, parts.dim).numpy(),
+            grad_features.view(-1, parts.features_dim).numpy(),
         )
-        of_embedding = ctx.embedding.backward(
-            gradients, grad_features.view(-1, parts.features_dim).numpy()
-        )
+        of_embedding = th.empty(parts.n_embedding, dtype=th.float32, device="cpu")
+        ctx.embedding.backward(of_first.numpy(), of_embedding.numpy())
         return (
             None,
             None,
             None,
             grad_points if needs_points else None,
             grad_features if needs_features else None,
-            *of_embedding,
-            *gradients.others,
+            *views_like(parts.embedding, of_embedding),
+            *others,
         )
 
 

@@ -16,18 +16,18 @@ Integers = NDArray[np.int64]
 
 
 class KernelInput(NamedTuple):
-    """The first layer of a network, of h outputs: points @ W^T + table[entries] + shifts.
+    """The first layer of a network, of h outputs: [points, features] @ weights + table[entries].
 
-    ``points`` (n, n_points); W are the first n_points of the ``stride`` columns of the layer's
-    weight; ``table`` (n_entries, h); ``entries`` (n,), where an empty array stands for zeros; and
-    ``shifts`` (m, h), each of which serves n / m neighboring rows; m may be 0.
+    ``points`` (n, n_points) and ``features`` (m, n_features), each of which serves n / m
+    neighboring rows; ``weights`` (n_points + n_features, h); ``table`` (n_entries, h); ``entries``
+    (n,), where an empty array stands for zeros.
     """
 
     points: Floats
-    stride: int
+    features: Floats
+    weights: Floats
     table: Floats
     entries: Integers
-    shifts: Floats
 
 
 class MLPLayout(NamedTuple):
@@ -48,14 +48,16 @@ class MLPLayout(NamedTuple):
 class MLPGradients(NamedTuple):
     """Gradients that an MLP's backward pass adds to.
 
-    ``parameters``: those of W^T (n_points, h), of the table, and of weight and bias of each layer
-    behind the first, flat, one behind the other; ``shifts`` (m, h). ``points`` (n, n_points) is
-    filled, or empty if it is not wanted.
+    ``first``: those of the first layer's weights (n_points + n_features, h) and of the table, and
+    ``others``: those of weight and bias of each layer behind the first, flat, one behind the other.
+    ``points`` (n, n_points) and ``features`` (m, n_features) are filled, or empty if they are not
+    wanted.
     """
 
-    parameters: Floats
-    shifts: Floats
+    first: Floats
+    others: Floats
     points: Floats
+    features: Floats
 
 
 class FieldLayout(NamedTuple):
@@ -82,41 +84,21 @@ class FieldLayout(NamedTuple):
 
 
 class FirstLayer(NamedTuple):
-    """What times and features contribute to a field's first layer of h outputs, and on the way.
+    """A field's first layer of h outputs, for points and features, and what comes before it.
 
-    The ``table`` of distinct times (n_times, h); the ``entries`` of it for each time (n_times,);
-    the ``shifts`` of features (m, h). For the backward pass the time embedding's ``hidden`` layer,
-    its ``derivatives``, and the ``embeddings`` plus b_o, each (n_times, embedding_dim).
+    The ``weights`` (dim + n_features, h) of points and features; the ``table`` of distinct times
+    (n_times, h); the ``entries`` of it for each time (n_times,). For the backward pass the
+    ``phases`` of the times (n_times, 2 n_frequencies); the time embedding's ``hidden`` layer, its
+    ``derivatives``, and the ``embeddings`` plus b_o, each (n_times, embedding_dim).
     """
 
+    weights: Floats
     table: Floats
     entries: Integers
-    shifts: Floats
+    phases: Floats
     hidden: Floats
     derivatives: Floats
     embeddings: Floats
-
-
-class FieldGradients(NamedTuple):
-    """Gradients of a field's first layer, and what follows from them.
-
-    Given are those of the first layer's summands, of h outputs: ``points`` W^T (dim, h), ``table``
-    (n_times, h) and ``shifts`` (m, h). Filled are those of the ``features`` (m, n_features), which
-    may be empty, and of the parameters in :class:`FieldLayout`, of their shapes.
-    """
-
-    points: Floats
-    table: Floats
-    shifts: Floats
-    features: Floats
-    time_hidden_weight: Floats
-    time_hidden_bias: Floats
-    time_output_weight: Floats
-    time_output_bias: Floats
-    observation_weight: Floats
-    observation_bias: Floats
-    first_weight: Floats
-    first_bias: Floats
 
 
 class FoldedNetwork(NamedTuple):
@@ -152,6 +134,64 @@ class Method(NamedTuple):
     tableau: Floats
 
 
+class LossTargets(NamedTuple):
+    """What a minibatch of m samples is to be like, for the losses of actor and critic.
+
+    Of PolicyFlow's actor, with k rows for each sample: ``actions`` and ``endpoints`` (m, dim),
+    ``advantages`` (m,), ``reference_velocity`` (m k, dim), ``scores`` (n_entries, 3), the
+    interpolant's score coefficients at each distinct time, ``log_std`` and ``old_log_std`` (dim,).
+    Of the critic: ``old_values`` and ``returns`` (m,).
+    """
+
+    actions: Floats
+    endpoints: Floats
+    advantages: Floats
+    reference_velocity: Floats
+    scores: Floats
+    log_std: Floats
+    old_log_std: Floats
+    old_values: Floats
+    returns: Floats
+
+
+class LossOptions(NamedTuple):
+    """Options of the losses of actor and critic.
+
+    The ``end_time`` of the interpolant, the ``latent_std``, whether the mean shift over a sample's
+    times has one surrogate (``averages_shift``), infinity for bounds that there are not,
+    ``sums_dimensions`` of the Brownian regularizer, and the weights of regularizers and critic.
+    """
+
+    end_time: float
+    latent_std: float
+    averages_shift: bool
+    clip_range: float
+    log_ratio_clamp: float
+    brownian_coef: float
+    sums_dimensions: bool
+    ent_coef: float
+    vf_coef: float
+    clip_range_vf: float
+
+
+class AdamOptions(NamedTuple):
+    """Options of Adam, by torch's names; ``decoupled`` weight decay is that of AdamW."""
+
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+    weight_decay: float
+    decoupled: bool
+
+
+N_SUMS = 8
+OBJECTIVE, CLIPPED, RATIO, LARGEST, KL, BROWNIAN, CHANGE, VALUE = range(N_SUMS)
+"""Where a kernel of losses adds up its terms: of the surrogate objective, whether a ratio is
+clipped, of the ratio, of the divergence, the Brownian regularizer, the change of the velocity, and
+the squared error of the value; ``LARGEST`` is the greatest absolute log ratio."""
+
+
 class Kernels(Protocol):
     """The functions of :mod:`sb3_policyflow.kernels._numba`, where they are documented."""
 
@@ -180,16 +220,25 @@ class Kernels(Protocol):
     ) -> None:
         """Add an MLP's gradients of some rows."""
 
-    def embed(self, times: Floats, features: Floats, field: FieldLayout, first: FirstLayer) -> int:
-        """Evaluate what times and features contribute to a field's first layer."""
+    def loss_gradients(
+        self,
+        first: KernelInput,
+        network: MLPLayout,
+        targets: LossTargets,
+        options: LossOptions,
+        is_actor: bool,
+        gradients: MLPGradients,
+        sums: NDArray[np.float64],
+        start: int,
+        stop: int,
+    ) -> None:
+        """Add the gradients of an actor's or a critic's loss on some samples."""
+
+    def embed(self, times: Floats, field: FieldLayout, first: FirstLayer) -> int:
+        """Evaluate a field up to what points and features contribute to its first layer."""
 
     def embed_backward(
-        self,
-        times: Floats,
-        features: Floats,
-        field: FieldLayout,
-        first: FirstLayer,
-        gradients: FieldGradients,
+        self, field: FieldLayout, first: FirstLayer, grad_first: Floats, grads: Floats
     ) -> None:
         """Gradients of what :meth:`embed` takes."""
 
@@ -210,3 +259,6 @@ class Kernels(Protocol):
 
     def clip(self, addresses: Integers, sizes: Integers, max_norm: float) -> float:
         """Clip arrays to a norm of all together, and return the norm that they had."""
+
+    def adam(self, addresses: Integers, sizes: Integers, options: AdamOptions) -> None:
+        """Take a step of Adam."""

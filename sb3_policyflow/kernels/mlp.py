@@ -1,7 +1,7 @@
 """MLPs evaluated and differentiated by kernels."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -27,6 +27,7 @@ from sb3_policyflow.kernels.layouts import (
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
 NO_INDEX: Integers = np.zeros(0, dtype=np.int64)
+NO_POINTS: Floats = np.zeros((0, 0), dtype=np.float32)
 
 
 class MLP:
@@ -56,6 +57,7 @@ class MLP:
         self.activation = activation
         self.tensors = [tensor for layer in layers for tensor in layer]
         self.held = [tensor.detach() for tensor in self.tensors]
+        self.n_parameters = sum(tensor.numel() for tensor in self.held)
         self.shapes = [tensor.shape for tensor in self.held]
         self.places = [tensor.data_ptr() for tensor in self.held]
         weights, biases = self.held[::2], self.held[1::2]
@@ -98,15 +100,6 @@ def read_mlp(kernels: Kernels, inspector: ModuleInspector, modules: Iterable[nn.
     return MLP(kernels, modules, layers, activations.pop())
 
 
-class Gradients(NamedTuple):
-    """Gradients of an MLP: of W^T and table, see :class:`KernelInput`, shifts, and other layers."""
-
-    points: th.Tensor
-    table: th.Tensor
-    shifts: Floats
-    others: list[th.Tensor]
-
-
 class Evaluation:
     """An evaluation of an MLP, forward and backward.
 
@@ -146,50 +139,56 @@ class Evaluation:
         parameters: Sequence[th.Tensor],
         grad_outputs: th.Tensor,
         grad_points: Floats,
-    ) -> Gradients:
+        grad_features: Floats,
+    ) -> tuple[th.Tensor, list[th.Tensor]]:
         """Differentiate.
 
         :param saved: What :meth:`forward` saved.
         :param parameters: Those of the MLP again.
         :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
         :param grad_points: Filled; shape (n, n_points), or empty if it is not wanted.
+        :param grad_features: Filled; shape (m, n_features), or empty if it is not wanted.
+        :return: Gradients of the first layer's weights and table, flat, and of other parameters.
         """
         network, first = self._network, self._first
-        n_points, (n_entries, width) = first.points.shape[1], first.table.shape
-        sizes = [n_points * width, n_entries * width, *(p.numel() for p in parameters[2:])]
-        # Each thread adds up its own; rows that share a shift belong to one thread.
-        flat = th.zeros(self._n_parts, sum(sizes), dtype=th.float32, device="cpu")
-        shifts, of_thread = np.zeros_like(first.shifts), flat.numpy()
+        n_first = first.weights.size + first.table.size
+        n_others = sum(parameter.numel() for parameter in parameters[2:])
+        # Each thread adds up its own.
+        flat = th.zeros(self._n_parts, n_first + n_others, dtype=th.float32, device="cpu")
+        of_thread = flat.numpy()
         layout, (values, derivatives) = network.layout_of(parameters), saved.numpy()
         outputs, run = grad_outputs.contiguous().numpy(), network.kernels.backward
 
         def run_part(part: int, start: int, stop: int) -> None:
-            gradients = MLPGradients(of_thread[part], shifts, grad_points)
+            of_first, of_others = of_thread[part, :n_first], of_thread[part, n_first:]
+            gradients = MLPGradients(of_first, of_others, grad_points, grad_features)
             run(first, layout, values, derivatives, outputs, gradients, start, stop)
 
         self._in_parts(run_part)
         total = flat[0] if self._n_parts == 1 else flat.sum(0)
-        points, table, *others = th.split(total, sizes)
-        return Gradients(
-            points.view(n_points, width),
-            table.view(n_entries, width),
-            shifts,
-            [part.view(p.shape) for part, p in zip(others, parameters[2:], strict=True)],
-        )
+        return total[:n_first], views_like(parameters[2:], total[n_first:])
 
     def _in_parts(self, run: Callable[[int, int, int], None]) -> None:
         """Call ``run(part, start, stop)`` for parts of the rows, the same parts on both passes.
 
-        What is saved depends on where blocks of rows begin, and rows that share a shift belong
-        together.
+        What is saved depends on where blocks of rows begin, and rows of a sample belong together.
         """
-        n_rows, n_shifts = len(self._first.points), len(self._first.shifts)
-        group = n_rows // n_shifts if n_shifts else 1
+        n_samples = len(self._first.features)
+        group = len(self._first.points) // n_samples
         in_parts(
-            n_rows // group,
+            n_samples,
             self._n_parts,
             lambda part, start, stop: run(part, start * group, stop * group),
         )
+
+
+def views_like(tensors: Sequence[th.Tensor], flat: th.Tensor) -> list[th.Tensor]:
+    """Views of a tensor, one behind the other, with the shapes of others.
+
+    >>> [view.shape for view in views_like([th.ones(2, 3), th.ones(4)], th.arange(10))]
+    [torch.Size([2, 3]), torch.Size([4])]
+    """
+    return list(th._C._nn.unflatten_dense_tensors(flat, list(tensors)))
 
 
 class _MLPEvaluation(th.autograd.Function):
@@ -210,23 +209,29 @@ class _MLPEvaluation(th.autograd.Function):
             module = nn.Sequential(*ctx.network.modules)
             return None, *differentiable_gradients(module, [inputs], parameters, grad_outputs)
         grad_inputs = th.empty_like(inputs if ctx.needs_input_grad[1] else inputs[:0])
-        gradients = ctx.evaluation.backward(saved, parameters, grad_outputs, grad_inputs.numpy())
+        of_first, others = ctx.evaluation.backward(
+            saved, parameters, grad_outputs, NO_POINTS, grad_inputs.numpy()
+        )
+        weight, bias = parameters[:2]
         return (
             None,
             grad_inputs if ctx.needs_input_grad[1] else None,
-            gradients.points.T.contiguous(),
-            gradients.table[0],
-            *gradients.others,
+            of_first[: weight.numel()].view(weight.T.shape).T.contiguous(),
+            of_first[weight.numel() :].view_as(bias),
+            *others,
         )
 
 
+def mlp_input(network: MLP, inputs: th.Tensor) -> KernelInput:
+    """An MLP's first layer as kernels take it: inputs are features, and there are no points."""
+    weight, bias = network.held[0].numpy(), network.held[1].numpy()
+    features = inputs.detach().numpy()
+    no_points = np.empty((len(features), 0), dtype=np.float32)
+    return KernelInput(no_points, features, np.ascontiguousarray(weight.T), bias[None], NO_INDEX)
+
+
 def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
-    bias = network.held[1].numpy()
-    no_shifts = np.zeros((0, bias.size), dtype=np.float32)
-    points = inputs.detach().numpy()
-    return Evaluation(
-        network, KernelInput(points, inputs.shape[1], bias[None], NO_INDEX, no_shifts)
-    )
+    return Evaluation(network, mlp_input(network, inputs))
 
 
 def differentiable_gradients(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
@@ -12,7 +13,8 @@ from torch import nn
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions, accepts_former_names
 from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
-from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
+from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow, MatchingSamples, draw_matching
+from sb3_policyflow.flows.bounds import half_ranges
 
 
 class PolicyFlowOptions(FlowOptions, total=False):
@@ -21,10 +23,14 @@ class PolicyFlowOptions(FlowOptions, total=False):
     interpolant: str
     n_flow_steps: int
     solver: str
-    latent_std: float
+    latent_std: float | None
     gaussian: bool
     log_std_init: float
     log_std_bounds: tuple[float, float] | None
+
+
+LATENT_STD = 0.2
+"""Standard deviation of the latents, in half the distance of the actions' bounds."""
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -39,7 +45,7 @@ def check_latents(policy: "PolicyFlowPolicy") -> None:
 
     :raises ValueError: With what to leave out.
     """
-    if policy.latent_std == 1.0:
+    if policy.latent_std in (None, 1.0):
         return
     if policy.gaussian:
         raise ValueError("With gaussian=True latents are 0: leave out latent_std.")
@@ -55,10 +61,10 @@ class PolicyFlowPolicy(BaseFlowPolicy):
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
 
-    ``latent_std`` is not of the paper, whose latents have a standard deviation of 1. Latents add
-    noise to the actions that the importance ratio does not see; where actions are bounded by 1, it
-    is larger than sigma. Narrower latents learn locomotion faster (HalfCheetah several times as
-    fast), and learn tasks less well in which rewards have to be found first (docs/results.md).
+    The paper's latents have a standard deviation of 1. Latents spread the actions, and the
+    importance ratio does not see that; where actions are bounded by 1, they would drown the noise
+    that it sees. By default they are in proportion to the action space, which is 1 on the paper's
+    MultiGoal.
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
@@ -66,8 +72,9 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         which the update compares velocities. Its ``end_time`` T is where the flow ends.
     :param n_flow_steps: Solver steps from z to phi.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
-    :param latent_std: Standard deviation of the latents z, greater than 0. Other than 1 it needs an
-        interpolant without noise of its own, "rectified" or "trigflow".
+    :param latent_std: Standard deviation of the latents z, greater than 0. None for a fifth of half
+        the distance of the actions' bounds in each dimension, or 1 where there are no bounds, or
+        none within 200, or where the interpolant has noise of its own: "stochastic" ones need 1.
     :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
     :param log_std_init: Initial log standard deviation of the Gaussian noise.
     :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.
@@ -78,11 +85,12 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         "interpolant": checks.one_of(INTERPOLANTS),
         "n_flow_steps": checks.at_least(1),
         "solver": checks.one_of(SOLVERS),
-        "latent_std": checks.positive,
+        "latent_std": checks.or_none(checks.positive),
         "log_std_init": checks.finite,
         "log_std_bounds": checks.or_none(checks.bounds),
     }
     combination_checks = (check_latents,)
+    latent_stds: th.Tensor
     fixed_options = frozenset({"log_std_init"})
 
     @accepts_former_names(path="interpolant")
@@ -95,7 +103,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         interpolant: str = "rectified",
         n_flow_steps: int = 12,
         solver: str = "midpoint",
-        latent_std: float = 1.0,
+        latent_std: float | None = None,
         gaussian: bool = False,
         log_std_init: float = 0.0,
         log_std_bounds: tuple[float, float] | None = None,
@@ -116,7 +124,23 @@ class PolicyFlowPolicy(BaseFlowPolicy):
 
     def _build_actor(self) -> None:
         self.velocity = self._make_velocity_field()
+        assert isinstance(self.action_space, spaces.Box)
+        ranges = half_ranges(self.action_space.low, self.action_space.high)
+        stds = np.where(np.isfinite(ranges), LATENT_STD * ranges, 1.0)
+        self._latent_std_of_all = float(stds[0]) if (stds == stds[0]).all() else None
+        like_weights: Any = {"dtype": th.float32, "device": "cpu"}
+        self.register_buffer("latent_stds", th.as_tensor(stds, **like_weights), persistent=False)
         self.log_std = nn.Parameter(th.zeros(self.action_dim))
+
+    @property
+    def latent_scale(self) -> float | th.Tensor:
+        if self.gaussian:
+            return 0.0
+        if self.latent_std is not None:
+            return self.latent_std
+        if INTERPOLANTS[self.interpolant].stochastic:
+            return 1.0
+        return self.latent_stds if self._latent_std_of_all is None else self._latent_std_of_all
 
     @property
     def flow(self) -> Flow:
@@ -145,16 +169,15 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         """End points phi, see :meth:`FlowPolicy.transport`."""
         return self.flow.solve(latents, features)
 
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
+        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
+
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
-        """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have z = 0, n = 0."""
-        if self.gaussian:
-            latents = features.new_zeros(len(features), self.action_dim)
-        else:
-            latents = self.draw_latents(features, deterministic)
-            if self.latent_std != 1.0:
-                latents = self.latent_std * latents
+        """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have no noise n."""
+        latents = self.draw_latents(features, deterministic)
         endpoints = self.transport(latents, features)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:

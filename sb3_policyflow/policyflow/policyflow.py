@@ -23,6 +23,7 @@ from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.flows import TIME_SAMPLERS
+from sb3_policyflow.policyflow.compiled import make_compiled_loss
 from sb3_policyflow.policyflow.policies import (
     CnnFlowPolicy,
     MlpFlowPolicy,
@@ -52,10 +53,13 @@ class PolicyFlowUpdate(FlowUpdate):
     :param rollout: The whole rollout of n samples.
     """
 
+    policy: PolicyFlowPolicy
+
     def __init__(self, algorithm: "PolicyFlow", rollout: FlowRolloutBufferSamples) -> None:
         super().__init__(algorithm, rollout)
-        self.policy = policy = algorithm.policy
+        policy = algorithm.policy
         self.flow = policy.flow
+        self.latent_std = 1.0 if policy.gaussian else policy.latent_scale
         # Line 3: the reference policy, theta-hat and sigma-hat. Its features are extracted once.
         self.reference_field = deepcopy(policy.velocity)
         self.reference_log_std = policy.noise_log_std.detach().clone()
@@ -72,6 +76,8 @@ class PolicyFlowUpdate(FlowUpdate):
         self.uniform_coef = algorithm.value_of("uniform_noise_coef")
         has_targets = algorithm.uniform_noise_coef != 0.0
         self.uniform_targets = UniformTargets.of(policy) if has_targets else None
+        if type(self) is PolicyFlowUpdate:  # a subclass may have other formulas
+            self.compiled_loss = make_compiled_loss(self)
 
     def draw(self) -> PathSamples:
         """Times and points for each sample, with the reference velocity there."""
@@ -121,7 +127,7 @@ class PolicyFlowUpdate(FlowUpdate):
         :param velocity: v there, shape (n, k, action_dim).
         """
         eta = self.flow.interpolant.brownian_residual(
-            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.policy.latent_std
+            velocity, drawn.reference_velocity, drawn.points, drawn.times, self.latent_std
         )
         squares = eta.square()
         over_actions = squares.sum(-1) if self.brownian_reduction == "sum" else squares.mean(-1)

@@ -20,12 +20,15 @@ class UniformTargets:
 
     :param action_space: The actions; SB3 takes bounded ones only.
     :param interpolant: The interpolant of the update.
-    :param latent_std: Standard deviation of the latents.
+    :param latent_std: Standard deviation of the latents: a number, or one for each dimension.
     :raises ValueError: If the interpolant draws noise of its own.
     """
 
     def __init__(
-        self, action_space: spaces.Box, interpolant: Interpolant, latent_std: float = 1.0
+        self,
+        action_space: spaces.Box,
+        interpolant: Interpolant,
+        latent_std: float | th.Tensor = 1.0,
     ) -> None:
         if interpolant.stochastic:
             raise ValueError(
@@ -41,7 +44,7 @@ class UniformTargets:
     def of(cls, policy: PolicyFlowPolicy) -> "UniformTargets":
         """The targets of a policy's flow."""
         assert isinstance(policy.action_space, spaces.Box)
-        return cls(policy.action_space, policy.flow.interpolant, policy.latent_std)
+        return cls(policy.action_space, policy.flow.interpolant, policy.latent_scale)
 
     def loss(self, velocity: VelocityField, features: th.Tensor) -> th.Tensor:
         """The mean squared error of the velocity.

@@ -1,11 +1,10 @@
 """An on-policy algorithm of SB3 whose runs resume exactly and stop at what would spoil them."""
 
-import functools
 import io
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -24,29 +23,18 @@ from sb3_policyflow.resilience.collection import (
     terminal_observations,
     time_limits,
 )
-from sb3_policyflow.resilience.files import atomic_write, check_archive, opened
+from sb3_policyflow.resilience.files import atomic_write, check_archive, opened, saved_attributes
 from sb3_policyflow.resilience.finite import check_rollout
-from sb3_policyflow.resilience.saving import RandomStates, ResumeState
+from sb3_policyflow.resilience.saving import (
+    Observed,
+    RandomStates,
+    ResumeState,
+    check_attributes,
+    takes_former_path,
+)
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def _takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
-    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
-
-    @functools.wraps(load)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
-        cls: Any = args[0]
-        is_positional = len(args) > 1 and "path" in kwargs
-        present = cls.former_names.get("path") if is_positional else None
-        if present is not None:
-            kwargs[present] = kwargs.pop("path")
-        return load(*args, **kwargs)
-
-    return wrapped
 
 
 class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
@@ -70,12 +58,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     former_names: ClassVar[Mapping[str, str]] = {}
     """Present names of attributes by former ones, by which files and ``load`` may know them."""
+    former_values: ClassVar[Mapping[str, Any]] = {}
+    """Values of attributes that files of earlier versions do not have."""
     unsaved: ClassVar[tuple[str, ...]] = (
-        "_callback",
-        "_step_checks",
-        "_saved_random_states",
-        "rank",
-        "other_resume_states",
+        *("_callback", "_step_checks", "_saved_random_states", "_saved_observed"),
     )
     """Attributes that no file has."""
 
@@ -88,6 +74,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """Which of the processes that train this model this one is."""
     other_resume_states: tuple[ResumeState, ...] = ()
     """Those of the processes after the first, which saves the model."""
+
+    _saved_observed: Observed | None = None
+    """What a file says of the observations in the training that it is from."""
 
     # Collecting rollouts
 
@@ -206,7 +195,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         """
         # SB3 saves the attributes that it finds, the last observations of this process too.
         state = self.own_resume_state()._replace(last_obs=None, last_episode_starts=None)
-        self.resume_state = state._replace(others=self.other_resume_states)
+        self.resume_state = state._replace(
+            observed=self.observed(), others=self.other_resume_states
+        )
         try:
             if isinstance(path, (str, pathlib.Path)):
                 with atomic_write(path, suffix="zip") as file:
@@ -231,7 +222,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), *self.unsaved]
 
     @classmethod
-    @_takes_former_path
+    @takes_former_path
     def load(
         cls: type[SelfResilient],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -262,9 +253,14 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             sets them, as SB3 does. So does a ``seed`` among ``kwargs``.
         :param kwargs: Attributes to change.
         :raises ValueError: If the file is no saved model, or the environment does not fit it.
+        :raises TypeError: If there is no attribute of a name among ``kwargs``.
         """
         with opened(path, suffix="zip") as file:
             check_archive(file, path, members=("data", "policy.pth"))
+            saved = saved_attributes(file)
+            check_attributes(cls, kwargs, saved)
+            missing = {k: v for k, v in cls.former_values.items() if k not in saved}
+            kwargs = {**missing, **kwargs}
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
@@ -273,9 +269,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         state = None if saved is None else saved.of_rank(model.rank)
         if not force_reset:
             model._continue_episodes(state)
+        model._saved_observed = None if state is None else state.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
+
+    def observed(self) -> Observed:
+        """What the policy observed in training: whether it was normalized, and the space before."""
+        normalize = self.get_vec_normalize_env()
+        if normalize is not None:
+            return Observed(normalize.norm_obs, normalize.venv.observation_space)
+        return self._saved_observed or Observed(False, self.observation_space)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Those that ``load`` has found are forgotten.

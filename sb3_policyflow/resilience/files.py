@@ -1,6 +1,7 @@
 """Files that are written completely or not at all, and checked before they are used."""
 
 import io
+import json
 import os
 import uuid
 import warnings
@@ -100,3 +101,15 @@ def check_archive(file: IO[bytes], path: Any, members: tuple[str, ...]) -> None:
         what = f"its member {damaged!r} is damaged" if damaged else f"it lacks {missing}"
         raise ValueError(f"{path} does not hold a saved model, for {what}: load another file.")
     file.seek(start)
+
+
+def saved_attributes(file: IO[bytes]) -> set[str]:
+    """Names of the attributes in a saved model; the file is left at its start.
+
+    :param file: The opened file, a whole archive.
+    """
+    start = file.tell()
+    with zipfile.ZipFile(file) as archive:
+        names = set(json.loads(archive.read("data")))
+    file.seek(start)
+    return names

@@ -1,12 +1,20 @@
-"""What SB3 does not save, though the rest of a run depends on it."""
+"""What SB3 does not save, though the rest of a run depends on it; and what ``load`` may change."""
 
+import functools
+import inspect
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
+
+from sb3_policyflow.hints import did_you_mean
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class RandomStates(NamedTuple):
@@ -42,18 +50,29 @@ def preserve_rng_state(device: th.device) -> Iterator[None]:
         states.restore(device)
 
 
-class ResumeState(NamedTuple):
-    """What a process needs to go on as it would have, besides what SB3 saves.
+class Observed(NamedTuple):
+    """What a policy observed in training.
 
-    Random states, and the running discounted returns of ``VecNormalize``, shape (n_envs,), which it
-    leaves out of its own ``save``; None if the model has no such wrapper. Where several processes
-    train the model, ``others`` has the states of all but the first, with their last observations
-    and episode starts, and ``statistics`` the attributes of ``VecNormalize`` that are running
-    statistics: a run that is restarted goes on with them by itself.
+    ``is_normalized`` says whether ``VecNormalize`` normalized observations, None if the file does
+    not say (version 0.1.0); ``space`` is that of the environment's own observations, if known.
+    """
+
+    is_normalized: bool | None
+    space: spaces.Space[Any] | None
+
+
+class ResumeState(NamedTuple):
+    """Random states, and what ``VecNormalize`` leaves out of its own ``save``.
+
+    ``normalized_returns`` are its running discounted returns, shape (n_envs,); None without it.
+    Where several processes train the model, ``others`` has the states of all but the first, with
+    their last observations and episode starts. A run that is restarted goes on by itself with
+    ``statistics``, the attributes of ``VecNormalize`` that are running statistics.
     """
 
     random_states: RandomStates
     normalized_returns: np.ndarray | None
+    observed: Observed | None = None
     last_obs: Any = None
     last_episode_starts: np.ndarray | None = None
     others: "tuple[ResumeState, ...]" = ()
@@ -66,3 +85,40 @@ class ResumeState(NamedTuple):
         """
         states = (self, *self.others)
         return states[rank] if rank < len(states) else None
+
+    def what_was_observed(self) -> Observed | None:
+        """What the policy observed; None if it was what the policy's own space says."""
+        if self.observed is None and self.normalized_returns is not None:
+            return Observed(None, None)
+        return self.observed
+
+
+def check_attributes(algorithm: type[Any], given: Collection[str], saved: Collection[str]) -> None:
+    """Refuse attributes for ``load`` to change that no model has.
+
+    :param algorithm: The class of the model.
+    :param given: Their names.
+    :param saved: Names of the attributes that are in the file.
+    :raises TypeError: With the nearest names.
+    """
+    arguments = inspect.signature(algorithm).parameters.keys() - {"policy", "env"}
+    known = {*arguments, *algorithm.former_names, *saved}
+    for name in given:
+        if name not in known and not hasattr(algorithm, name):
+            meant = did_you_mean(name, known, "the file has no such attribute.")
+            raise TypeError(f"{algorithm.__name__}.load has no {name!r} to change: {meant}")
+
+
+def takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
+    """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
+
+    @functools.wraps(load)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> T:
+        cls: Any = args[0]
+        is_positional = len(args) > 1 and "path" in kwargs
+        present = cls.former_names.get("path") if is_positional else None
+        if present is not None:
+            kwargs[present] = kwargs.pop("path")
+        return load(*args, **kwargs)
+
+    return wrapped

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
+from tqdm import tqdm
 
 pytest.importorskip("rl_zoo3")
 
@@ -22,6 +24,7 @@ from sb3_policyflow.benchmark.measure import costs
 from sb3_policyflow.benchmark.measure.evaluation import EvaluationCallback, evaluate, modes
 from sb3_policyflow.benchmark.report.table import comparison_table, overall_table, results_table
 from sb3_policyflow.benchmark.results import Result, Run, load_results
+from sb3_policyflow.benchmark.run import steps_of_runs
 from sb3_policyflow.benchmark.train_one import train_and_measure
 
 
@@ -142,6 +145,30 @@ def test_environments_that_there_are_not_are_named_before_a_training(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_misspelt_hyperparameter_is_refused_before_a_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--envs", "Pendulum-v1", "--steps", "10", "--out", str(tmp_path)]
+    for algo, name in (("policyflow", "n_epoch"), ("ppo", "n_epoch")):
+        with pytest.raises(SystemExit, match=r"no hyperparameter 'n_epoch': did you mean n_epochs"):
+            main(["run", *settings, "--algos", algo, "--hyperparams", f"{name}:4"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_how_far_a_training_is_by_its_log(tmp_path: Path) -> None:
+    run = Run("ppo", "ppo", "Pendulum-v1", 0, 10)
+    log = run.path(tmp_path, ".log")
+    log.parent.mkdir(parents=True)
+    bar = tqdm(total=1, disable=True)
+    shown = []
+    bar.set_postfix_str = shown.append  # type: ignore[method-assign,assignment]
+    for text in ("", "warning", "trained: 10%\ntrained: 50%\n", "trained: 90%\nexit code 0\n"):
+        log.write_text(text)
+        with steps_of_runs([run], tmp_path, bar, every=0.01):
+            time.sleep(0.1)
+    assert list(dict.fromkeys(shown)) == ["", f"{run}: starting", f"{run}: 50%"]
+
+
 def test_an_unknown_algorithm_is_refused_with_the_choices(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -217,6 +244,7 @@ def test_usage(arguments: list[str], code: int, capsys: pytest.CaptureFixture[st
 def result(name: str, seed: int, value: float, env: str = "Pendulum-v1") -> Result:
     summary: dict[str, Any] = {
         "final": {"stochastic": {"mean_return": value}},
+        "timesteps": 8192,  # whole rollouts, where 100 were asked for
         "gradient_steps": 1000,
         "network_evaluations": {"acting": 1e6, "updating": 2e6},
         "seconds": {"training": 90.0},
@@ -228,7 +256,7 @@ def test_tables_by_hand() -> None:
     results = [result("ours", seed, value) for seed, value in enumerate([1.0, 3.0, 5.0, 99.0])]
     results += [result("theirs", seed, float(seed)) for seed in range(5)]
     ours, theirs = results_table(results).splitlines()[2:]
-    assert ours.startswith("| Pendulum-v1, 1e+02 steps | ours | 4 | 27 (1 to 99) |")
+    assert ours.startswith("| Pendulum-v1, 8,192 steps | ours | 4 | 27 (1 to 99) |")
     assert ours.endswith("| - | - | 1,000 | 1.0 M / 2.0 M | 1.5 |")
     assert "| theirs | 5 | 2 [" in theirs
     assert "| ours | theirs | 0.75 (15 of 20) |" in comparison_table(results)
@@ -285,7 +313,7 @@ def test_evaluation_leaves_the_training_alone() -> None:
     again = [evaluate(model, evaluation, mode, 2)["mean_return"] for mode in modes(model)]
     assert found == again
     assert found[0] == found[1] != found[2]  # no noise but the latents'
-    assert not model.policy.random_latents
+    assert model.policy.deterministic_action == "mode"
     np.testing.assert_array_equal(env.obs_rms.mean, mean)  # type: ignore[union-attr]
     np.testing.assert_array_equal(evaluation.obs_rms.mean, mean)  # type: ignore[union-attr]
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # type: ignore[index]

@@ -76,7 +76,7 @@ def test_saved_model_acts_and_goes_on_as_before(
     algorithm: Algorithm, options: dict[str, Any], tmp_path: Path
 ) -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", 2))
-    model = algorithm("MlpPolicy", env, desired_kl=0.01, **TWO_EPOCHS, **options).learn(256)
+    model = algorithm("MlpPolicy", env, desired_kl=1e-6, **TWO_EPOCHS, **options).learn(256)
     assert model.adaptive_learning_rate != 3e-4
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=env)
@@ -102,18 +102,18 @@ def test_predict(algorithm: Algorithm, options: dict[str, Any]) -> None:
     sampled = model.predict(obs)[0]
     assert not np.array_equal(sampled, model.predict(obs)[0])
     assert model.action_space.contains(sampled[0])
-    model.policy.random_latents = True
+    model.policy.deterministic_action = "drawn"
     latent_only = model.predict(obs, deterministic=True)[0]
     assert not np.array_equal(latent_only, deterministic)
 
 
 def test_latents_that_are_always_drawn_survive_a_file(algorithm: type[Any], tmp_path: Path) -> None:
-    kwargs = {**TINY, "random_latents": True}
+    kwargs = {**TINY, "deterministic_action": "drawn"}
     algorithm("MlpPolicy", "Pendulum-v1", policy_kwargs=kwargs, **SMALL).save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model")
     loaded.policy.save(tmp_path / "policy")
     for policy in (loaded.policy, type(loaded.policy).load(tmp_path / "policy")):
-        assert policy.random_latents
+        assert policy.deterministic_action == "drawn"
 
 
 def test_dict_observations(algorithm: type[Any]) -> None:
@@ -165,10 +165,12 @@ DELIBERATE_DIFFERENCES = {
     "policy": {"annotation"},
     # None, or a number that is not positive, turns clipping off.
     "max_grad_norm": {"annotation"},
-    # May be a schedule.
+    # May be schedules, also in words.
     "ent_coef": {"annotation"},
+    "learning_rate": {"annotation"},
+    "clip_range_vf": {"annotation"},
     # FPO's ratios are those of an average over probes, and move less.
-    "clip_range": {"default"},
+    "clip_range": {"annotation", "default"},
     # As their papers integrate: PolicyFlow with 12 midpoint steps, FPO with 10 Euler steps.
     "n_flow_steps": {"default"},
     "solver": {"default"},

@@ -44,7 +44,7 @@ POLICY_ARGUMENTS: dict[str, tuple[Any, str | Callable[[Any], bool]]] = {
     "net_arch": ([5], lambda p: p.velocity.output.in_features == 5 == p.value_net.in_features),
     "activation_fn": (nn.ReLU, lambda p: type(p.mlp_extractor.value_net[1]) is nn.ReLU),
     "ortho_init": (False, lambda p: bool(p.value_net.bias.any())),
-    "use_sde": (True, "use_sde is an option of the algorithm"),
+    "use_sde": (True, "use_sde: it belongs to gSDE"),
     "log_std_init": (-1.0, "has no log_std_init: only PolicyFlow"),
     "full_std": (False, "full_std: it belongs to gSDE"),
     "use_expln": (True, "use_expln: it belongs to gSDE"),

@@ -43,6 +43,8 @@ SHARED: dict[str, Any] = {
     "advantage_scope": "rollout",
     "timeout_bootstrap": "none",
     "n_steps": 24,
+    "n_critic_warmup": 1,
+    "imitation_coef": 50.0,
 }
 DRAWN: dict[str, Any] = {"n_entropy_actions": 3, "n_entropy_states": 2}
 OWN: dict[type[Any], dict[str, Any]] = {
@@ -72,7 +74,6 @@ OWN: dict[type[Any], dict[str, Any]] = {
         "denoising_gamma": 0.5,
         "clip_range_base": 1e-4,
         "clip_range_rate": 30.0,
-        "n_critic_warmup": 1,
         **DRAWN,
     },
 }
@@ -124,7 +125,12 @@ def new(algorithm: type[Any], **options: Any) -> Any:
     """A model; one whose sizes do not divide each other warns, which is not the matter here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return make(algorithm, steps(2), **{**SIZES, **options})
+        model = make(algorithm, steps(2), **{**SIZES, **options})
+    if algorithm is not PPO:
+        # The policy is pulled towards what it was at the beginning, as if that had been cloned.
+        state = model.policy.state_dict()
+        model.cloned_parameters = {name: part.numpy().copy() for name, part in state.items()}
+    return model
 
 
 def trained(model: Any, callback: Any = None) -> th.Tensor:
@@ -333,12 +339,12 @@ def test_options_that_do_not_go_together() -> None:
 
 
 def test_options_changed_to_and_fro(tmp_path: Path) -> None:
-    model = new(PolicyFlow, policy_kwargs={"random_latents": True, "n_flow_steps": 5})
-    for n_flow_steps, random_latents in ((4, False), (5, True), (6, False)):
-        model.n_flow_steps, model.random_latents = n_flow_steps, random_latents
+    model = new(PolicyFlow, policy_kwargs={"deterministic_action": "drawn", "n_flow_steps": 5})
+    for n_flow_steps, kind in ((4, "zero"), (5, "drawn"), (6, "mode")):
+        model.n_flow_steps, model.deterministic_action = n_flow_steps, kind
         model.learn(32).save(tmp_path / "model")
         loaded = PolicyFlow.load(tmp_path / "model").policy
-        assert (loaded.n_flow_steps, loaded.random_latents) == (n_flow_steps, random_latents)
+        assert (loaded.n_flow_steps, loaded.deterministic_action) == (n_flow_steps, kind)
 
 
 def test_former_names_do_not_come_back(tmp_path: Path) -> None:

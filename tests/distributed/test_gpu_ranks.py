@@ -25,11 +25,11 @@ def operations() -> dict[str, Any]:
     group.connect(device)
     parameter = th.nn.Parameter(th.zeros(3, 2, device=device))
     parameter.grad = th.ones(3, 2, device=device)
-    loss = group.average_gradients([parameter], th.tensor(2.0, device=device))
+    loss = group.average_gradients([parameter], 2.0)
     mean, std = group.mean_std(th.tensor([1.0, 2.0, 3.0], device=device))
     return {
         "backend": dist.get_backend(),
-        "numbers": [loss.item(), mean.item(), std.item(), parameter.grad.sum().item()],
+        "numbers": [loss, mean.item(), std.item(), parameter.grad.sum().item()],
         "metrics": group.average_metrics({"loss": 1.0, "log_ratio_max": 2.0}),
         "objects": [group.gather("a"), group.from_first("b"), group.gather_on_first("c")],
     }

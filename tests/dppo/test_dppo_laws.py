@@ -132,55 +132,11 @@ def test_only_the_last_steps_are_trained() -> None:
     assert th.equal(base["output.weight"], trained["output.weight"])
 
 
-def test_only_the_critic_warms_up() -> None:
-    model = DPPO(
-        "MlpPolicy",
-        "Pendulum-v1",
-        n_steps=64,
-        n_epochs=3,
-        n_critic_warmup=2,
-        desired_kl=0.01,
-        ent_coef=0.01,
-        seed=0,
-    )
-    untrained = model.policy.velocity.output.weight.clone()
-    critic = model.policy.value_net.weight.clone()
-    model.learn(2 * 64)
-    assert th.equal(model.policy.velocity.output.weight, untrained)
-    assert not th.equal(model.policy.value_net.weight, critic)
-    assert model.adaptive_learning_rate == 3e-4
-    model.learn(64, reset_num_timesteps=False)
-    assert not th.equal(model.policy.velocity.output.weight, untrained)
-
-
 def image_model(**options: Any) -> DPPO:
     env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
     policy_kwargs = {"initialization": "glorot", **options.pop("policy_kwargs", {})}
     sizes = {"n_steps": 32, "batch_size": 16, "n_epochs": 4, "learning_rate": 1e-3}
     return DPPO("CnnPolicy", env, policy_kwargs=policy_kwargs, seed=0, **sizes, **options)
-
-
-@pytest.mark.parametrize("share", [True, False])
-def test_the_critic_warms_up_without_the_extractor_of_the_actor(share: bool) -> None:
-    model = image_model(n_critic_warmup=2, policy_kwargs={"share_features_extractor": share})
-    obs = model.observation_space.sample()
-    before = model.predict(obs, deterministic=True)[0]
-    critic = model.policy.value_net.weight.clone()
-    model.learn(2 * 32)
-    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], before)
-    assert not th.equal(model.policy.value_net.weight, critic)
-    model.learn(32, reset_num_timesteps=False)
-    assert not np.array_equal(model.predict(obs, deterministic=True)[0], before)
-
-
-def test_warming_up_takes_rollouts_however_long_their_updates() -> None:
-    model, _ = collected(DPPO, n_critic_warmup=2)
-    model.n_epochs = 4
-    untrained = model.policy.velocity.output.weight.clone()
-    model.train()
-    assert th.equal(model.policy.velocity.output.weight, untrained)
-    model.train()
-    assert not th.equal(model.policy.velocity.output.weight, untrained)
 
 
 def test_frozen_steps_do_not_follow_the_extractor() -> None:

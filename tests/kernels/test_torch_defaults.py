@@ -13,6 +13,7 @@ from sb3_policyflow.export import ActionModule
 from tests.helpers import SMALL, TINY, weights
 
 SHARED: dict[str, Any] = {"clip_range_vf": 0.2, "ent_coef": 0.01, "desired_kl": 0.01}
+DRAWN = {"deterministic_action": "drawn"}
 RUNS: list[tuple[Any, dict[str, Any]]] = [
     (PolicyFlow, {}),
     (PolicyFlow, {**SHARED, "brownian_coef": 0.1, "uniform_noise_coef": 0.1, "n_times": 2}),
@@ -23,7 +24,10 @@ RUNS: list[tuple[Any, dict[str, Any]]] = [
     (FPO, {"trust_region": "spo", "action_noise_std": 0.1, "timeout_bootstrap": "current"}),
     (DPPO, {}),
     (DPPO, {**SHARED, "clip_range_base": 0.01, "n_denoising_steps": 4, "n_finetuned_steps": 3}),
-    (DPPO, {"process": "flow", "noise_clip": None, "policy_kwargs": {"random_latents": True}}),
+    (
+        DPPO,
+        {"process": "flow", "noise_clip": None, "policy_kwargs": DRAWN},
+    ),
 ]
 
 

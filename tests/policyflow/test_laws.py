@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 from torch.distributions import Independent, Normal
@@ -11,7 +13,7 @@ from torch.distributions import Independent, Normal
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import clipped_surrogate
-from sb3_policyflow.policyflow.policies import PolicyFlowRecord
+from sb3_policyflow.policyflow.policies import PolicyFlowPolicy, PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import PathSamples, PolicyFlowUpdate
 from tests.helpers import learned, perturb
 
@@ -35,6 +37,7 @@ def tiny_model(**options: Any) -> PolicyFlow:
         "features_extractor_class": DoubleExtractor,
         **options.pop("policy_kwargs", {}),
     }
+    options = {"latent_std": 1.0, **options}  # the paper's
     model = PolicyFlow(
         "MlpFlowPolicy",
         "Pendulum-v1",
@@ -211,8 +214,24 @@ def test_latents_have_their_standard_deviation() -> None:
         _, record = policy.sample_actions(features)
         assert record.latents.std().item() == pytest.approx(0.2, rel=0.03)
         th.testing.assert_close(record.endpoints, policy.transport(record.latents, features))
+        policy.deterministic_action = "zero"
         _, record = policy.sample_actions(features, deterministic=True)
     assert not record.latents.any()
+
+
+def test_latents_are_in_proportion_to_the_action_space() -> None:
+    """A fifth of half the distance of the bounds, or the paper's 1 where they mean nothing."""
+    low, high = np.array([-1, -2, 0, -np.inf, -1e3], np.float32), np.array([1, 2, 3, 1, 1e3])
+    space = spaces.Box(low, high.astype(np.float32))
+    policy = PolicyFlowPolicy(spaces.Box(-1, 1, (3,)), space, lambda _: 1e-3)
+    expected = th.tensor([0.2, 0.4, 0.3, 1.0, 1.0])
+    th.testing.assert_close(policy.latent_scale, expected)
+    latents = policy.draw_latents(th.zeros(50_000, 3), deterministic=False)
+    th.testing.assert_close(latents.std(dim=0), expected, rtol=0.02, atol=0)
+    multigoal = PolicyFlowPolicy(spaces.Box(-1, 1, (4,)), spaces.Box(-5, 5, (2,)), lambda _: 1e-3)
+    assert multigoal.latent_scale == 1.0
+    policy.interpolant = "stochastic"
+    assert policy.latent_scale == 1.0
 
 
 def test_approximate_ratio_approaches_the_exact_one_for_small_updates() -> None:

@@ -107,8 +107,13 @@ def test_float64_actions_and_observations() -> None:
     train(PolicyFlow("MlpPolicy", Float64(), **TWO_EPOCHS), 64)
 
 
-def test_deterministic_actions_are_where_the_zero_latent_ends() -> None:
-    model = PolicyFlow("MlpPolicy", "Pendulum-v1", **TWO_EPOCHS).learn(64)
+def test_deterministic_actions_may_be_where_the_zero_latent_ends() -> None:
+    model = PolicyFlow(
+        "MlpPolicy",
+        "Pendulum-v1",
+        policy_kwargs={"deterministic_action": "zero"},
+        **TWO_EPOCHS,
+    ).learn(64)
     obs = np.stack([model.observation_space.sample() for _ in range(5)])
     deterministic, _ = model.predict(obs, deterministic=True)
     with th.no_grad():

@@ -294,7 +294,7 @@ def test_archives_of_something_else(tmp_path: Path) -> None:
 
 def test_models_of_another_algorithm(tmp_path: Path) -> None:
     PPO("MlpPolicy", "Pendulum-v1").save(tmp_path / "ppo")
-    with pytest.raises(ValueError, match="trains policies derived from PolicyFlowPolicy"):
+    with pytest.raises(ValueError, match=r"saved by PPO, not by PolicyFlow: use PPO\.load"):
         PolicyFlow.load(tmp_path / "ppo")
 
 

@@ -37,7 +37,7 @@ def main() -> None:
         parameter = th.nn.Parameter(th.zeros(n_numbers))
         parameter.grad = th.zeros(n_numbers)
         repetitions = 300 if n_numbers < 1_000_000 else 20
-        average = partial(group.average_gradients, [parameter], th.zeros(()))
+        average = partial(group.average_gradients, [parameter], 0.0)
         spent = microseconds(average, repetitions)
         lines.append(f"gradients of {4 * n_numbers / 1e6:.2f} MB: {spent:.0f} us")
     values = th.zeros(64)

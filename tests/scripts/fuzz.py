@@ -82,7 +82,7 @@ networks = st.fixed_dictionaries(
         "net_arch": layers | st.fixed_dictionaries({}, optional={"pi": layers, "vf": layers}),
         "activation_fn": st.sampled_from([th.nn.Mish, th.nn.ELU, th.nn.ReLU]),
         "share_features_extractor": st.booleans(),
-        "initialization": st.sampled_from(["glorot", "glorot_zero_output", "zero"]),
+        "initialization": st.sampled_from(["orthogonal", "glorot", "glorot_zero_output", "zero"]),
         "frequencies": st.integers(1, 3) | st.just([1.0, 2.0]),
     },
 )
@@ -109,6 +109,7 @@ common: dict[str, st.SearchStrategy[Any]] = {
     ),
     "advantage_scope": st.sampled_from(["minibatch", "rollout"]),
     "timeout_bootstrap": st.sampled_from(["terminal", "current", "none"]),
+    "n_critic_warmup": st.integers(0, 2),
 }
 ode: dict[str, st.SearchStrategy[Any]] = {
     "solver": st.sampled_from(["euler", "midpoint", "heun", "rk4", "ab2"]),
@@ -157,7 +158,6 @@ own: dict[type[Any], dict[str, st.SearchStrategy[Any]]] = {
         "denoising_gamma": st.sampled_from([0.9, 1.0]),
         "clip_range_base": st.sampled_from([None, 0.01]),
         "clip_range_rate": st.sampled_from([0.5, 3.0]),
-        "n_critic_warmup": st.integers(0, 2),
         **entropy,
     },
 }
@@ -172,6 +172,7 @@ refused: dict[str, list[Any]] = {
     "ent_coef": [-0.1, "linear", float("inf")],
     "vf_coef": [float("nan")],
     "desired_kl": [0.0],
+    "n_critic_warmup": [-1],
     "lr_adaptation_kwargs": [{"interval": "step"}, {"bounds": (1e-2, 1e-6)}, {"factor": 1.0}],
     "use_sde": [True],
 }
@@ -189,7 +190,6 @@ refused_of: dict[type[Any], dict[str, list[Any]]] = {
         "log_prob_reduction": ["max"],
         "denoising_gamma": [0.0, 1.5],
         "clip_range_base": [0.0],
-        "n_critic_warmup": [-1],
     },
 }
 

@@ -123,9 +123,13 @@ def write_figures(results: Sequence[Result], folder: Path, mode: str = STOCHASTI
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT_FOLDER)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=DEFAULT_FOLDER, help="what `run` has written"
+    )
     parser.add_argument("--out", type=Path, help="a folder; that of the results if not given")
-    parser.add_argument("--mode", choices=MODES, default=STOCHASTIC)
+    parser.add_argument(
+        "--mode", choices=MODES, default=STOCHASTIC, help="how policies acted; default: %(default)s"
+    )
 
 
 def main(arguments: argparse.Namespace) -> int:

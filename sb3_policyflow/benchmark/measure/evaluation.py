@@ -29,16 +29,17 @@ def modes(model: BaseAlgorithm) -> tuple[str, ...]:
 
 
 @contextmanager
-def _random_latents_enabled(model: BaseAlgorithm, mode: str) -> Iterator[None]:
+def _latents_drawn_if(model: BaseAlgorithm, mode: str) -> Iterator[None]:
     if mode != LATENT_ONLY:
         yield
         return
     assert isinstance(model.policy, FlowPolicy)
-    before, model.policy.random_latents = model.policy.random_latents, True
+    policy = model.policy
+    before, policy.deterministic_action = policy.deterministic_action, "drawn"
     try:
         yield
     finally:
-        model.policy.random_latents = before
+        policy.deterministic_action = before
 
 
 def evaluate(model: BaseAlgorithm, env: VecEnv, mode: str, n_episodes: int) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, mode: str, n_episodes: int) -> d
     if training_env is not None:
         sync_envs_normalization(training_env, env)
     env.seed(EVALUATION_SEED)
-    with seeded(EVALUATION_SEED, model.device), _random_latents_enabled(model, mode):
+    with seeded(EVALUATION_SEED, model.device), _latents_drawn_if(model, mode):
         returns, lengths = evaluate_policy(
             model,
             env,

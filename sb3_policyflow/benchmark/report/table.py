@@ -53,14 +53,15 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _row(results: Sequence[Result], name: str, env: str) -> list[str]:
-    steps = {result.run.steps for result in results}
+    # What was trained: whole rollouts, of which the last may go beyond what was asked for.
+    steps = {result.summary["timesteps"] for result in results}
     evaluations = [result.summary["network_evaluations"] for result in results]
     acting, updating = (np.mean([e[key] for e in evaluations]) for key in ("acting", "updating"))
     minutes = np.mean([result.summary["seconds"]["training"] for result in results]) / 60
     returns = [[result.final_return(mode) for result in results] for mode in MODES]
     found = [[value for value in values if value is not None] for values in returns]
     return [
-        f"{env}, {' / '.join(f'{step:.2g}' for step in sorted(steps))} steps",
+        f"{env}, {' / '.join(f'{step:,}' for step in sorted(steps))} steps",
         name,
         str(len(results)),
         *(over_seeds(values).format() if values else "-" for values in found),
@@ -175,7 +176,9 @@ def report(results: Sequence[Result], overall: bool = False) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT_FOLDER)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=DEFAULT_FOLDER, help="what `run` has written"
+    )
     parser.add_argument("--out", type=Path, help="a file; the terminal if not given")
     parser.add_argument(
         "--overall",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.metadata
 import re
 import subprocess
@@ -10,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from gymnasium.error import DependencyNotInstalled, NameNotFound
 
-from sb3_policyflow.envs.extras import import_extra, install_command
+from sb3_policyflow.envs.extras import import_extra
 from sb3_policyflow.envs.task_names import PLAYGROUND
+from sb3_policyflow.hints import did_you_mean, install_command
 
 if TYPE_CHECKING:
     from sb3_policyflow.envs.playground.batch import Overrides, PlaygroundBatch
@@ -31,9 +31,7 @@ def require_task(task: str) -> None:
 
     names = all_tasks()
     if task not in names:
-        nearest = difflib.get_close_matches(task, names, n=3, cutoff=0.4)
-        advice = f"nearest: {', '.join(nearest)}" if nearest else f"it has {', '.join(names)}"
-        raise NameNotFound(f"MuJoCo Playground has no task {task!r}; {advice}.")
+        raise NameNotFound(f"MuJoCo Playground has no task {task!r}: {did_you_mean(task, names)}")
 
 
 def _require_playground(env_id: str) -> None:
@@ -46,7 +44,7 @@ def _require_playground(env_id: str) -> None:
         oldest = ".".join(map(str, OLDEST_VERSION))
         raise DependencyNotInstalled(
             f"{env_id} needs playground {oldest} or newer, and {version} is installed: "
-            f"{install_command('playground')}"
+            f"run `{install_command('playground')}`"
         )
     import_extra("mujoco_playground", "playground", env_id)
 

@@ -6,8 +6,11 @@ hyperparameters; ``convert_flow_params`` turns the raw values into the same hype
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from contextvars import ContextVar
+from typing import Any, NamedTuple
 
+import numpy as np
+from gymnasium import spaces
 from optuna import Trial
 from torch import nn
 
@@ -27,6 +30,31 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 RENAMED = {"path": "interpolant", "n_probes": "n_mc_samples", "probe_average": "mc_average"}
 """New names of options by those that studies of earlier versions have."""
 
+
+class Task(NamedTuple):
+    """What a search space depends on and rl_zoo3 does not hand on.
+
+    ``n_timesteps`` are those of a trial, None if not known. ``action_scale`` is the mean half width
+    of the action space; 1 where actions have no bounds.
+    """
+
+    n_timesteps: int | None = None
+    action_scale: float = 1.0
+
+    @classmethod
+    def of(cls, n_timesteps: int, action_space: spaces.Space[Any]) -> "Task":
+        """The task of trainings of some length with actions of this space."""
+        if not isinstance(action_space, spaces.Box) or not action_space.is_bounded():
+            return cls(n_timesteps)
+        return cls(n_timesteps, float(np.mean((action_space.high - action_space.low) / 2)))
+
+
+UNKNOWN_TASK = Task()
+TASK: ContextVar[Task] = ContextVar("TASK", default=UNKNOWN_TASK)
+"""The task of the trial that is being drawn."""
+
+MIN_UPDATES = 10
+"""Rollouts are no longer than a trial has timesteps for so many, if it has for the shortest."""
 
 Sampler = Callable[[Trial, int, int, dict[str, Any]], dict[str, Any]]
 """What rl_zoo3 calls: with the trial, the number of action dimensions, the number of environments
@@ -68,10 +96,16 @@ def sampler(
 
 @sampler("policyflow")
 def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
-    """Draw hyperparameters of PolicyFlow."""
+    """Draw hyperparameters of PolicyFlow.
+
+    Latents are as wide as a share of the actions' range. The Brownian regularizer of wider latents
+    is smaller by the square, which its weight makes up for.
+    """
+    scale = TASK.get().action_scale
+    lowest, highest = 1e-4 * scale**2, 0.5 * scale**2
     params = {
         "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
-        "brownian_coef": trial.suggest_float("brownian_coef", 1e-4, 0.5, log=True),
+        "brownian_coef": trial.suggest_float("brownian_coef", lowest, highest, log=True),
         "interpolant": trial.suggest_categorical(
             "interpolant", ["rectified", "stochastic", "trigflow"]
         ),
@@ -80,7 +114,7 @@ def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
         "log_std_init": trial.suggest_float("log_std_init", -2.5, 0.5),
     }
     if params["interpolant"] != "stochastic":
-        params["latent_std"] = trial.suggest_float("latent_std", 0.1, 1.0, log=True)
+        params["latent_std"] = trial.suggest_float("latent_std", 0.1 * scale, scale, log=True)
     return params
 
 
@@ -115,13 +149,19 @@ def suggest_on_policy(trial: Trial, n_envs: int, clip_ranges: Sequence[float]) -
     """Draw what every on-policy algorithm has, for rollouts that grow with ``n_envs``.
 
     The rollout has between 1024 and 32768 transitions, and at least 8 steps of each environment.
+    Short trials have rollouts short enough for :data:`MIN_UPDATES` of them.
     """
     shortest = max(10, (n_envs - 1).bit_length() + 3)
+    longest = max(15, shortest + 3)
+    if (n_timesteps := TASK.get().n_timesteps) is not None:
+        most = max(n_timesteps // MIN_UPDATES, 1).bit_length() - 1
+        shortest = max((n_envs - 1).bit_length() + 3, min(shortest, most), 5)
+        longest = max(shortest, min(longest, most))
     return {
         # A single value: it is drawn so that the study keeps it.
         "n_envs": trial.suggest_int("n_envs", n_envs, n_envs),
-        "rollout_pow": trial.suggest_int("rollout_pow", shortest, max(15, shortest + 3)),
-        "n_minibatches_pow": trial.suggest_int("n_minibatches_pow", 2, 6),
+        "rollout_pow": trial.suggest_int("rollout_pow", shortest, longest),
+        "n_minibatches_pow": trial.suggest_int("n_minibatches_pow", 2, min(6, shortest - 3)),
         "n_epochs": trial.suggest_categorical("n_epochs", [3, 5, 10, 20]),
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.1, log=True),
         "one_minus_gae_lambda": trial.suggest_float("one_minus_gae_lambda", 1e-3, 0.2, log=True),

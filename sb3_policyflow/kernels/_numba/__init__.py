@@ -7,10 +7,12 @@ a time through a network to stay in the caches. Get them from
 
 from sb3_policyflow.kernels._numba.embedding import embed, embed_backward
 from sb3_policyflow.kernels._numba.flow import flow
-from sb3_policyflow.kernels._numba.memory import are_same, clip
+from sb3_policyflow.kernels._numba.losses import loss_gradients
+from sb3_policyflow.kernels._numba.memory import adam, are_same, clip
 from sb3_policyflow.kernels._numba.mlp import backward, forward
 
 __all__ = [
+    "adam",
     "are_same",
     "backward",
     "clip",
@@ -18,4 +20,5 @@ __all__ = [
     "embed_backward",
     "flow",
     "forward",
+    "loss_gradients",
 ]

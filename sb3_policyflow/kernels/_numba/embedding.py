@@ -1,6 +1,6 @@
-"""What time and observation contribute to the first layer of a velocity field.
+"""A velocity field up to its first layer, as a table of times and weights of points and features.
 
-table = (MLP(cos, sin of 2 pi f t) + b_o) W_e^T + b,    shifts = features (W_e W_o)^T
+table = (MLP(cos, sin of 2 pi f t) + b_o) W_e^T + b,    weights = [W_x, W_e W_o]^T
 """
 
 import math
@@ -21,7 +21,6 @@ from sb3_policyflow.kernels._numba.matrices import (
 from sb3_policyflow.kernels._numba.memory import matrix, vector
 from sb3_policyflow.kernels._numba.options import F, inner, kernel
 from sb3_policyflow.kernels.layouts import (
-    FieldGradients,
     FieldLayout,
     FirstLayer,
     Floats,
@@ -51,16 +50,14 @@ def _deduplicate(times: Floats, entries: Integers) -> int:
 
 
 @inner
-def _phases(times: Floats, frequencies: Floats) -> Floats:
+def _fill_phases(times: Floats, frequencies: Floats, outputs: Floats) -> None:
     """Cosines and sines, shape (n_times, 2 n_frequencies)."""
     n_frequencies = frequencies.size
-    outputs = np.empty((times.size, 2 * n_frequencies), F)
     for row in range(times.size):
         for i in range(n_frequencies):
             phase = F(2 * math.pi) * times[row] * frequencies[i]
             outputs[row, i] = math.cos(phase)
             outputs[row, n_frequencies + i] = math.sin(phase)
-    return outputs
 
 
 @inner
@@ -72,11 +69,10 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> No
 
 
 @kernel
-def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer) -> int:
-    """Evaluate what times and features contribute to a field's first layer.
+def embed(times: Floats, field: FieldLayout, first: FirstLayer) -> int:
+    """Evaluate a field up to what points and features contribute to its first layer.
 
     :param times: shape (n_times,); the distinct ones are moved to the front.
-    :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
     :param first: Filled; the table is as long as there are distinct times.
     :return: How many distinct times there are.
@@ -84,7 +80,8 @@ def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer
     n, dim = _deduplicate(times, first.entries), field.dim
     size, width, table = first.hidden.shape[1], first.table.shape[1], first.table[:n]
     hidden, derivatives, embeddings = first.hidden[:n], first.derivatives[:n], first.embeddings[:n]
-    phases = _phases(times[:n], vector(field.frequencies, field.n_frequencies))
+    phases = first.phases[:n]
+    _fill_phases(times[:n], vector(field.frequencies, field.n_frequencies), phases)
     weights = transposed(matrix(field.time_hidden_weight, size, 2 * field.n_frequencies))
     _layer(phases, weights, vector(field.time_hidden_bias, size), hidden)
     activate_with_derivatives(
@@ -94,64 +91,67 @@ def embed(times: Floats, features: Floats, field: FieldLayout, first: FirstLayer
     _layer(hidden, weights, vector(field.time_output_bias, size), embeddings)
     for row in range(n):
         add(vector(field.observation_bias, size), embeddings[row])
-    of_embedding = transposed(matrix(field.first_weight, width, dim + size))[dim:]
+    first_weights = transposed(matrix(field.first_weight, width, dim + size))
+    of_embedding = first_weights[dim:]
     _layer(embeddings, of_embedding, vector(field.first_bias, width), table)
-    clear(first.shifts)
-    observation = matrix(field.observation_weight, size, features.shape[1])
-    accumulate(features, product(observation.T, of_embedding), first.shifts)
+    for i in range(dim):
+        copy(first_weights[i], first.weights[i])
+    observation = matrix(field.observation_weight, size, first.weights.shape[0] - dim)
+    _fill_product(transposed(observation), of_embedding, first.weights[dim:])
     return n
 
 
 @kernel
 def embed_backward(
-    times: Floats,
-    features: Floats,
-    field: FieldLayout,
-    first: FirstLayer,
-    gradients: FieldGradients,
+    field: FieldLayout, first: FirstLayer, grad_first: Floats, grads: Floats
 ) -> None:
     """Gradients of what :func:`embed` takes.
 
-    :param times: The distinct times, shape (n_times,).
-    :param features: shape (m, n_features).
     :param field: The embeddings and the first layer.
     :param first: What :func:`embed` filled.
-    :param gradients: Of the first layer, and filled.
+    :param grad_first: Those of the first layer's weights (dim + n_features, h) and table
+        (n_distinct, h), flat.
+    :param grads: Filled with those of the parameters in :class:`FieldLayout`, flat, in its order.
     """
-    n, dim, (width, n_inputs) = times.size, field.dim, gradients.first_weight.shape
-    size, n_features = n_inputs - dim, features.shape[1]
-    hidden, derivatives, embeddings = first.hidden[:n], first.derivatives[:n], first.embeddings[:n]
+    dim, size, width = field.dim, first.hidden.shape[1], first.table.shape[1]
+    n_features, n_phases = first.weights.shape[0] - dim, first.phases.shape[1]
+    n_weights, n_inputs = first.weights.size, dim + size
+    n = (grad_first.size - n_weights) // width
+    grad_points = grad_first[: dim * width].reshape((dim, width))
+    grad_folded = grad_first[dim * width : n_weights].reshape((n_features, width))
+    grad_table = grad_first[n_weights:].reshape((n, width))
+    phases, hidden, derivatives = first.phases[:n], first.hidden[:n], first.derivatives[:n]
     first_weight = matrix(field.first_weight, width, n_inputs)
     of_embedding = np.empty((width, size), F)
     for row in range(width):
         copy(first_weight[row, dim:], of_embedding[row])
-    observation = transposed(matrix(field.observation_weight, size, n_features))
-    grad_folded = product(features.T, gradients.shifts)
-    grad_of_embedding = product(gradients.table.T, embeddings)
-    accumulate(grad_folded.T, observation, grad_of_embedding)
-    grad_embeddings = product(gradients.table, of_embedding)
+    grad_embeddings = product(grad_table, of_embedding)
     grad_hidden = product(grad_embeddings, matrix(field.time_output_weight, size, size))
     multiply(grad_hidden.reshape(-1), derivatives.reshape(-1))
-    if gradients.features.shape[0] > 0:
-        clear(gradients.features)
-        folded = product(observation, transposed(of_embedding))
-        accumulate(gradients.shifts, transposed(folded), gradients.features)
 
-    phases = _phases(times, vector(field.frequencies, field.n_frequencies))
-    _fill_product(grad_hidden.T, phases, gradients.time_hidden_weight)
-    _fill_sums(grad_hidden, gradients.time_hidden_bias)
-    _fill_product(grad_embeddings.T, hidden, gradients.time_output_weight)
-    _fill_sums(grad_embeddings, gradients.time_output_bias)
-    copy(
-        transposed(product(grad_folded, of_embedding)).reshape(-1),
-        gradients.observation_weight.reshape(-1),
-    )
-    copy(gradients.time_output_bias, gradients.observation_bias)
+    end = size * n_phases
+    _fill_product(grad_hidden.T, phases, grads[:end].reshape((size, n_phases)))
+    start, end = end, end + size
+    _fill_sums(grad_hidden, grads[start:end])
+    start, end = end, end + size * size
+    _fill_product(grad_embeddings.T, hidden, grads[start:end].reshape((size, size)))
+    start, end = end, end + size
+    sums = grads[start:end]
+    _fill_sums(grad_embeddings, sums)
+    start, end = end, end + size * n_features
+    copy(transposed(product(grad_folded, of_embedding)).reshape(-1), grads[start:end])
+    start, end = end, end + size
+    copy(sums, grads[start:end])
+    start, end = end, end + width * n_inputs
+    observation = transposed(matrix(field.observation_weight, size, n_features))
+    grad_of_embedding = product(grad_table.T, first.embeddings[:n])
+    accumulate(grad_folded.T, observation, grad_of_embedding)
+    grad_first_weight = grads[start:end].reshape((width, n_inputs))
     for row in range(width):
         for i in range(dim):
-            gradients.first_weight[row, i] = gradients.points[i, row]
-        copy(grad_of_embedding[row], gradients.first_weight[row, dim:])
-    _fill_sums(gradients.table, gradients.first_bias)
+            grad_first_weight[row, i] = grad_points[i, row]
+        copy(grad_of_embedding[row], grad_first_weight[row, dim:])
+    _fill_sums(grad_table, grads[end : end + width])
 
 
 @inner

@@ -11,6 +11,7 @@ from sb3_policyflow.kernels._numba.matrices import (
     clear,
     copy,
     multiply,
+    product,
     project,
     transposed,
 )
@@ -69,7 +70,7 @@ def total(widths: Integers) -> int:
 
 
 @inner
-def _arrange(network: MLPLayout) -> Floats:
+def arranged(network: MLPLayout) -> Floats:
     """Copy what lies between first layer and output, as :func:`hidden_layers` takes it."""
     widths = network.widths
     size = 0
@@ -84,6 +85,67 @@ def _arrange(network: MLPLayout) -> Floats:
         copy(vector(network.biases[layer], n_out), weights[end + n_in * n_out :])
         end += (n_in + 1) * n_out
     return weights
+
+
+@inner
+def rows_of_a_sample(first: KernelInput) -> int:
+    """How many rows share the features of a sample."""
+    return first.points.shape[0] // max(first.features.shape[0], 1)
+
+
+@inner
+def rows_of_a_block(first: KernelInput) -> int:
+    """How many rows to carry through a network together: whole samples, and at least one."""
+    group = rows_of_a_sample(first)
+    return max(ROWS - ROWS % group, group)
+
+
+@inner
+def first_layer(first: KernelInput, begin: int, end: int, layer: Floats) -> None:
+    """Evaluate the first layer of a block of whole samples, without activation."""
+    n_points, group = first.points.shape[1], rows_of_a_sample(first)
+    for row in range(begin, end):
+        copy(first.table[first.entries[row] if first.entries.size > 0 else 0], layer[row - begin])
+    accumulate(first.points[begin:end], first.weights[:n_points], layer)
+    features, weights = first.features[begin // group : end // group], first.weights[n_points:]
+    if group == 1:
+        accumulate(features, weights, layer)
+    else:
+        of_samples = product(features, weights)
+        for row in range(end - begin):
+            add(of_samples[row // group], layer[row])
+
+
+@inner
+def first_layer_backward(
+    first: KernelInput, begin: int, end: int, grad: Floats, gradients: MLPGradients
+) -> None:
+    """Add the gradients of a block's first layer.
+
+    :param grad: Those of what it yields, shape (end - begin, h).
+    """
+    (n_points, n_features), width = (first.points.shape[1], first.features.shape[1]), grad.shape[1]
+    n_inputs, group = n_points + n_features, rows_of_a_sample(first)
+    weights = gradients.first[: n_inputs * width].reshape((n_inputs, width))
+    table = gradients.first[n_inputs * width :]
+    for row in range(begin, end):
+        entry = first.entries[row] if first.entries.size > 0 else 0
+        add(grad[row - begin], table[entry * width : (entry + 1) * width])
+    accumulate(first.points[begin:end].T, grad, weights[:n_points])
+    if gradients.points.shape[0] > 0:
+        no_bias = np.zeros(n_points, F)
+        project(grad, first.weights[:n_points], no_bias, gradients.points[begin:end])
+    of_samples = grad
+    if group > 1:
+        of_samples = np.zeros(((end - begin) // group, width), F)
+        for row in range(end - begin):
+            add(grad[row], of_samples[row // group])
+    features = first.features[begin // group : end // group]
+    accumulate(features.T, of_samples, weights[n_points:])
+    if gradients.features.shape[0] > 0:
+        grad_features = gradients.features[begin // group : end // group]
+        clear(grad_features)
+        accumulate(of_samples, transposed(first.weights[n_points:]), grad_features)
 
 
 @kernel
@@ -104,31 +166,22 @@ def forward(
     :param values: Filled with the activations of all hidden layers for :func:`backward`, block by
         block, n * sum(widths); or empty.
     :param derivatives: Likewise with their derivatives.
-    :param start: The first row.
-    :param stop: The row behind the last.
+    :param start: The first row of a sample.
+    :param stop: The row behind the last of a sample.
     """
-    points, entries, shifts, widths = first.points, first.entries, first.shifts, network.widths
-    width, n_saved, n_outputs = widths[0], total(widths), outputs.shape[1]
-    weight_points = transposed(
-        matrix(network.weights[0], width, first.stride)[:, : points.shape[1]]
-    )
-    hidden = _arrange(network)
-    weight = matrix(network.weights[-1], n_outputs, widths[-1])
-    bias = vector(network.biases[-1], n_outputs)
-    workspace = np.empty(min(ROWS, stop - start) * n_saved, F)
-    group = points.shape[0] // max(shifts.shape[0], 1)
-    for begin in range(start, stop, ROWS):
-        end = min(begin + ROWS, stop)
+    widths, n_saved, block_rows = network.widths, total(network.widths), rows_of_a_block(first)
+    hidden = arranged(network)
+    weight = matrix(network.weights[-1], outputs.shape[1], widths[-1])
+    bias = vector(network.biases[-1], outputs.shape[1])
+    workspace = np.empty(min(block_rows, stop - start) * n_saved, F)
+    for begin in range(start, stop, block_rows):
+        end = min(begin + block_rows, stop)
         block = workspace[: (end - begin) * n_saved]
         derivatives_block = derivatives[begin * n_saved : end * n_saved]
         if derivatives.size > 0:
             block = values[begin * n_saved : end * n_saved]
-        layer = block[: (end - begin) * width].reshape((end - begin, width))
-        for row in range(begin, end):
-            copy(first.table[entries[row] if entries.size > 0 else 0], layer[row - begin])
-            if shifts.shape[0] > 0:
-                add(shifts[row // group], layer[row - begin])
-        accumulate(points[begin:end], weight_points, layer)
+        layer = block[: (end - begin) * widths[0]].reshape((end - begin, widths[0]))
+        first_layer(first, begin, end, layer)
         last = hidden_layers(
             hidden, widths, network.kind, F(network.alpha), block, derivatives_block
         )
@@ -153,44 +206,36 @@ def backward(
     :param values: What :func:`forward` filled.
     :param derivatives: Likewise.
     :param grad_outputs: The gradient of the outputs, shape (n, n_outputs).
-    :param gradients: Added to; groups of rows that share a shift belong to one call.
-    :param start: The first row.
-    :param stop: The row behind the last.
+    :param gradients: Added to; rows of a sample belong to one call.
+    :param start: The first row of a sample.
+    :param stop: The row behind the last of a sample.
     """
-    points, entries, widths = first.points, first.entries, network.widths
-    width, n_saved, n_points = widths[0], total(widths), points.shape[1]
-    n_entries, n_shifts = first.table.shape[0], gradients.shifts.shape[0]
-    group = points.shape[0] // max(n_shifts, 1)
-    widest = 0
-    for layer_width in widths:
-        widest = max(widest, layer_width)
-    scratch = np.empty((2, min(ROWS, stop - start) * widest), F)
-    table_start, table_end = n_points * width, (n_points + n_entries) * width
-    grad_first = gradients.parameters[:table_start].reshape((n_points, width))
-    grad_table = gradients.parameters[table_start:table_end].reshape((n_entries, width))
-    for begin in range(start, stop, ROWS):
-        end = min(begin + ROWS, stop)
-        grad = _backward_block(
+    n_saved, block_rows = total(network.widths), rows_of_a_block(first)
+    scratch = backward_scratch(network, min(block_rows, stop - start))
+    for begin in range(start, stop, block_rows):
+        end = min(begin + block_rows, stop)
+        grad = backward_block(
             network,
             values[begin * n_saved : end * n_saved],
             derivatives[begin * n_saved : end * n_saved],
             grad_outputs[begin:end],
-            gradients.parameters[table_end:],
+            gradients.others,
             scratch,
         )
-        accumulate(points[begin:end].T, grad, grad_first)
-        for row in range(begin, end):
-            add(grad[row - begin], grad_table[entries[row] if entries.size > 0 else 0])
-            if n_shifts > 0:
-                add(grad[row - begin], gradients.shifts[row // group])
-        if gradients.points.shape[0] > 0:
-            weight = matrix(network.weights[0], width, first.stride)[:, :n_points]
-            no_bias = np.zeros(n_points, F)
-            project(grad, transposed(weight), no_bias, gradients.points[begin:end])
+        first_layer_backward(first, begin, end, grad, gradients)
 
 
 @inner
-def _backward_block(
+def backward_scratch(network: MLPLayout, rows: int) -> Floats:
+    """Space for the gradients of two layers."""
+    widest = 0
+    for width in network.widths:
+        widest = max(widest, width)
+    return np.empty((2, rows * widest), F)
+
+
+@inner
+def backward_block(
     network: MLPLayout,
     values: Floats,
     derivatives: Floats,

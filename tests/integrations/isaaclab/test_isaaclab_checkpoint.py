@@ -117,7 +117,9 @@ def test_what_cannot_be_resumed_is_refused_before_the_simulator_starts(
             other.writestr(name, b"{}" if name.endswith(".pth") else whole.read(name))
     assert_refused([*common, "other.zip"], "other.zip cannot be resumed: ")
     FPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8).save("fpo.zip")
-    assert_refused([*common, "fpo.zip"], "fpo.zip cannot be resumed: ", "not FPOPolicy")
+    assert_refused(
+        [*common, "fpo.zip"], "fpo.zip cannot be resumed: ", "saved by FPO, not by PolicyFlow"
+    )
     assert_refused([*common, "model", "agent=large"], "leave out agent=large, or --checkpoint")
     changes = ["agent.gamma=0.9", "env.x=1", "agent.n_timesteps=9"]
     assert_refused([*common, "model.zip", *changes], "leave out agent.gamma=0.9, or --checkpoint")

@@ -9,10 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
-import sb3_policyflow  # noqa: F401  # registers
+import sb3_policyflow  # registers
 from sb3_policyflow.envs import PLAYGROUND_TASKS
 from sb3_policyflow.envs.multigoal import MultiGoalVectorEnv
 from sb3_policyflow.envs.native import make_native_vec_env
@@ -190,3 +192,104 @@ def test_schedules_of_our_own_parameters(tmp_path: Path) -> None:
     experiment = manager(tmp_path, "policyflow", "Pendulum-v1", hyperparams=schedules)
     model, _ = experiment.setup_experiment()
     assert (model.brownian_coef, model.ent_coef) == ("lin_0.5_0.1", "lin_0.01")
+
+
+def evaluated(experiment: ExperimentManager) -> Any:
+    """Whether the evaluations of an experiment act deterministically."""
+    experiment.setup_experiment()
+    [callback] = [each for each in experiment.callbacks if isinstance(each, EvalCallback)]
+    return callback.deterministic
+
+
+def test_evaluations_are_stochastic_by_one_key(tmp_path: Path) -> None:
+    quick = {"n_timesteps": 64, "n_envs": 1, "policy": "MlpPolicy"}
+    (tmp_path / "mine.yml").write_text(
+        yaml.safe_dump({"Pendulum-v1": {**quick, "deterministic_eval": False}})
+    )
+    for algo in ("policyflow", "ppo"):
+        options = {"config": str(tmp_path / "mine.yml"), "eval_freq": 32}
+        assert not evaluated(manager(tmp_path, algo, "Pendulum-v1", **options))
+        # What -params gives comes last.
+        options["hyperparams"] = {"deterministic_eval": True}
+        assert evaluated(manager(tmp_path, algo, "Pendulum-v1", **options))
+    assert evaluated(manager(tmp_path, "policyflow", "Pendulum-v1", eval_freq=32))
+    wrong = manager(tmp_path, "ppo", "Pendulum-v1", hyperparams={"deterministic_eval": "no"})
+    with pytest.raises(SystemExit, match="must be True or False, got 'no'"):
+        wrong.setup_experiment()
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_the_value_of_a_trial_is_that_of_the_chosen_evaluation(
+    deterministic: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+    predict = sb3_policyflow.PolicyFlow.predict
+
+    def watched(self: Any, *args: Any, deterministic: bool = False, **kwargs: Any) -> Any:
+        asked.append(deterministic)
+        return predict(self, *args, deterministic=deterministic, **kwargs)
+
+    monkeypatch.setattr(sb3_policyflow.PolicyFlow, "predict", watched)
+    experiment = manager(
+        tmp_path,
+        "policyflow",
+        "Pendulum-v1",
+        optimize_hyperparameters=True,
+        n_timesteps=400,
+        n_trials=1,
+        n_evaluations=1,
+        n_eval_episodes=1,
+        no_optim_plots=True,
+        hyperparams={"deterministic_eval": deterministic},
+    )
+    experiment.setup_experiment()
+    experiment.hyperparameters_optimization()
+    assert set(asked) == {deterministic}
+
+
+def test_a_misspelt_hyperparameter_ends_the_command_with_a_sentence(tmp_path: Path) -> None:
+    experiment = manager(tmp_path, "policyflow", "Pendulum-v1", hyperparams={"n_epoch": 3})
+    with pytest.raises(SystemExit, match=r"no hyperparameter 'n_epoch': did you mean n_epochs"):
+        experiment.setup_experiment()
+
+
+class TwoWays(gym.Env[Any, Any]):
+    """Only actions other than 0 are rewarded."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), float(abs(action[0]) > 0.2), True, False, {}
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_the_user_is_told_of_a_deterministic_action_between_modes(
+    deterministic: bool, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    gym.register("TwoWays-v0", TwoWays)
+    try:
+        experiment = manager(
+            tmp_path,
+            "policyflow",
+            "TwoWays-v0",
+            n_timesteps=64,
+            eval_freq=64,
+            hyperparams={
+                "deterministic_eval": deterministic,
+                "n_envs": 1,
+                "n_steps": 64,
+                "batch_size": 64,
+                "normalize": False,
+            },
+        )
+        experiment.learn(experiment.setup_experiment()[0])
+    finally:
+        del gym.registry["TwoWays-v0"]
+    told = [str(each.message) for each in recwarn if "may lie between" in str(each.message)]
+    assert len(told) == deterministic
+    assert all("-params deterministic_eval:False" in text for text in told)

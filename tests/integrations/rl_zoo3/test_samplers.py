@@ -1,15 +1,23 @@
+import contextvars
 import warnings
 
 import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
+from gymnasium import spaces
 from optuna.samplers import RandomSampler
 from optuna.trial import FixedTrial
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.algorithms import ALGORITHMS
-from sb3_policyflow.integrations.rl_zoo3.samplers import SAMPLERS, convert_flow_params
+from sb3_policyflow.integrations.rl_zoo3.samplers import (
+    SAMPLERS,
+    TASK,
+    Task,
+    convert_flow_params,
+)
 
 N_ENVS = [1, 3, 8, 24, 32, 1000, 1024, 4096]
 
@@ -91,3 +99,37 @@ def test_every_choice_is_drawn_and_reaches_the_policy() -> None:
     assert model.policy.solver == drawn[0]["solver"]
     assert model.policy.n_flow_steps == drawn[0]["n_flow_steps"]
     assert model.policy.embedding_dim == drawn[0]["policy_kwargs"]["embedding_dim"]
+
+
+def draws_for(task: Task, algo: str, n_envs: int = 1, number: int = 50) -> list[dict[str, object]]:
+    def draw() -> list[dict[str, object]]:
+        TASK.set(task)
+        return [hyperparams for _, hyperparams in draws(algo, n_envs, number)]
+
+    return contextvars.copy_context().run(draw)
+
+
+@pytest.mark.parametrize("n_timesteps", [500, 4_000, 100_000, 10_000_000])
+@pytest.mark.parametrize("n_envs", [1, 8, 1024])
+def test_short_trials_have_short_rollouts(algo: str, n_timesteps: int, n_envs: int) -> None:
+    for hyperparams in draws_for(Task(n_timesteps), algo, n_envs):
+        n_steps, batch_size = int(hyperparams["n_steps"]), int(hyperparams["batch_size"])  # type: ignore[call-overload]
+        rollout = n_steps * n_envs
+        # Ten updates, unless the environments alone take more.
+        assert 10 * rollout <= n_timesteps or n_steps <= max(8, 32 // n_envs)
+        assert 8 <= batch_size <= rollout // 4
+        assert rollout <= max(2**15, 2**7 * n_envs)
+
+
+def test_the_spread_is_drawn_on_the_scale_of_the_actions() -> None:
+    task = Task.of(10**6, spaces.Box(-5.0, 5.0, (3,)))
+    assert task.action_scale == 5.0
+    drawn = draws_for(task, "policyflow", number=200)
+    stds = [params["policy_kwargs"].get("latent_std") for params in drawn]  # type: ignore[attr-defined]
+    stds = [std for std in stds if std is not None]
+    assert 0.5 <= min(stds) < 1
+    assert 2.5 < max(stds) <= 5
+    coefs = np.array([params["brownian_coef"] for params in drawn], dtype=float) / 25
+    assert 1e-4 <= coefs.min() < 1e-3
+    assert 0.1 < coefs.max() <= 0.5
+    assert Task.of(10, spaces.Box(-np.inf, np.inf, (3,))).action_scale == 1.0

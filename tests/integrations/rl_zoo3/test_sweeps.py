@@ -124,6 +124,20 @@ def test_workers_share_a_study_and_one_is_killed(
     assert states == [TrialState.RUNNING, TrialState.COMPLETE, TrialState.COMPLETE]
 
 
+def test_two_workers_start_together_on_a_new_file(installed: Environment, tmp_path: Path) -> None:
+    command = sweep(f"sqlite:///{tmp_path}/new.db", 1)
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.mkdir()
+    workers = [installed.start(command, folder) for folder in folders]
+    outputs = [worker.communicate()[0] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], "\n".join(outputs)
+    study = optuna.load_study(study_name="s", storage=f"sqlite:///{tmp_path}/new.db")
+    assert [trial.state for trial in study.trials] == [TrialState.COMPLETE] * 2
+    # A trial of 1024 steps has updated its policy at least ten times.
+    assert all(trial.params["rollout_pow"] <= 6 for trial in study.trials)
+
+
 def test_a_diverging_trial_is_pruned(installed: Environment, tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     diverging = {**CHEAP, "learning_rate": 1e30, "desired_kl": None, "activation_fn": "relu"}

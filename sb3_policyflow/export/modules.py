@@ -1,25 +1,14 @@
-"""Export of policies to files that run without this package: ONNX, or torch alone.
+"""A policy with all that stands around it in training, as one module of PyTorch."""
 
-.. code-block:: bash
-
-    python -m sb3_policyflow.export model.zip policy.onnx --vecnormalize vecnormalize.pkl
-"""
-
-import argparse
-import pickle
-import sys
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.common.policies import FlowPolicy
 
 Observations = th.Tensor | dict[str, th.Tensor]
@@ -57,6 +46,22 @@ class NormalizeObservation(nn.Module):
         return normalized.clamp(-self.clip, self.clip).float()
 
 
+class PlainMish(nn.Module):
+    """Mish, x tanh(log(1 + exp x)), of operators that every runtime can evaluate in advance."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Apply it to a tensor of any shape."""
+        return x * nn.functional.softplus(x).tanh()
+
+
+def _with_plain_mish(module: nn.Module) -> None:
+    """Replace ``nn.Mish`` in a module; onnxruntime warns of each one whose input is constant."""
+    for name, part in module.named_children():
+        if isinstance(part, nn.Mish):
+            setattr(module, name, PlainMish())
+        _with_plain_mish(part)
+
+
 class ActionModule(nn.Module):
     """Maps observations to actions, as ``predict(deterministic=True)`` does.
 
@@ -66,15 +71,27 @@ class ActionModule(nn.Module):
     :param policy: The policy, which is copied.
     :param normalize: The ``VecNormalize`` that the policy was trained with. Without it the module
         takes observations that are normalized already.
+    :param space: Space of the environment's own observations, for their dtype; by default that of
+        the environment that ``normalize`` wraps, or of the policy.
     """
 
     low: th.Tensor
     high: th.Tensor
 
-    def __init__(self, policy: FlowPolicy, normalize: VecNormalize | None = None) -> None:
+    def __init__(
+        self,
+        policy: FlowPolicy,
+        normalize: VecNormalize | None = None,
+        space: spaces.Space[Any] | None = None,
+    ) -> None:
         super().__init__()
         self.policy = deepcopy(getattr(policy, "_orig_mod", policy)).cpu()
         self.policy.set_training_mode(False)
+        if self.policy.deterministic_action == "drawn":
+            self.policy.deterministic_action = "mode"
+        _with_plain_mish(self.policy)
+        wrapped = None if normalize is None else vars(normalize).get("venv")
+        self.raw_space = space if wrapped is None else wrapped.observation_space
         self.normalizers = nn.ModuleDict(_normalizers(self.policy.observation_space, normalize))
         box = self.policy.action_space
         assert isinstance(box, spaces.Box)
@@ -86,13 +103,14 @@ class ActionModule(nn.Module):
 
         :param observations: Observations of the environment, with images channels first: a tensor
             (n, ...), or a dictionary of tensors.
-        :param latents: z, where the flow starts, shape (n, action_dim); zeros if not given.
-            PolicyFlow's latents have standard deviation ``latent_std``.
+        :param latents: z, where the flow starts, shape (n, action_dim); those of the deterministic
+            action if not given. Drawn ones are normal with standard deviation
+            ``policy.latent_scale``.
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
         if latents is None:
-            latents = features.new_zeros(features.shape[0], self.policy.action_dim)
+            latents = self.policy.draw_latents(features, deterministic=True)
         actions = self.policy.transport(latents, features).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
@@ -121,9 +139,12 @@ class ActionModule(nn.Module):
         return observations, th.zeros(2, self.policy.action_dim, dtype=th.float32, device="cpu")
 
     def _zeros(self, key: str, space: spaces.Space[Any]) -> th.Tensor:
-        """Zeros of the dtype that the input has: float32 if it is normalized in the graph."""
+        """Zeros of the dtype that the input has, which is the environment's."""
         assert space.shape is not None
-        dtype = np.float32 if key in self.normalizers else space.dtype
+        dtype = space.dtype
+        if key in self.normalizers:  # the policy's space is that of normalized observations
+            raw = self.raw_space[key] if isinstance(self.raw_space, spaces.Dict) else self.raw_space
+            dtype = np.dtype(np.float32) if raw is None else raw.dtype
         return th.as_tensor(np.zeros((2, *space.shape), dtype=dtype), device="cpu")
 
 
@@ -136,97 +157,3 @@ def _normalizers(
         keys = normalize.norm_obs_keys or []
         return {key: NormalizeObservation(normalize, key) for key in keys}
     return {"all": NormalizeObservation(normalize)}
-
-
-def export(
-    policy: FlowPolicy,
-    path: str | Path,
-    normalize: VecNormalize | None = None,
-    latents: bool = False,
-) -> None:
-    """Write a policy to a file that runs without this package.
-
-    An ``.onnx`` file is a graph for onnxruntime and similar programs. Its inputs are "observation",
-    or the keys of a Dict space, and with ``latents`` also "latents"; its output is "actions". A
-    ``.pt2`` file is a program for ``torch.export.load``. The batch may have any size.
-
-    :param policy: The policy, ``model.policy``.
-    :param path: The file, which ends in ".onnx" or ".pt2".
-    :param normalize: The ``VecNormalize`` that the policy was trained with. If it is missing, the
-        file takes observations that are normalized already, and returns wrong actions for others.
-    :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise z = 0.
-    :raises ValueError: If ``path`` has another suffix.
-    """
-    path = Path(path)
-    if path.suffix not in (".onnx", ".pt2"):
-        raise ValueError(f"The file must end in '.onnx' or '.pt2', got {path.name!r}.")
-    module = ActionModule(policy, normalize).eval()
-    example = module.example(latents)
-    with th.no_grad():
-        program = th.export.export(module, example, dynamic_shapes=_any_batch(example))
-    if path.suffix == ".pt2":
-        th.export.save(program, path)
-    else:
-        _write_onnx(program, example, path)
-
-
-def _any_batch(example: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Dynamic shapes in which the first axis of every input may have any size."""
-    batch = {0: th.export.Dim.DYNAMIC}
-    return tuple(
-        dict.fromkeys(part, batch) if isinstance(part, dict) else batch for part in example
-    )
-
-
-def _write_onnx(program: th.export.ExportedProgram, example: tuple[Any, ...], path: Path) -> None:
-    observations = example[0]
-    names = list(observations) if isinstance(observations, dict) else ["observation"]
-    th.onnx.export(
-        program,
-        f=path,
-        input_names=[*names, "latents"][: len(names) + len(example) - 1],
-        output_names=["actions"],
-        dynamo=True,
-        external_data=False,
-        verbose=False,
-    )
-
-
-def load_policy(path: str | Path) -> FlowPolicy:
-    """Load the policy of a saved model, whichever algorithm of this package trained it.
-
-    :param path: The model's zip file.
-    :return: The policy, on the CPU.
-    :raises ValueError: If no algorithm of this package trained it.
-    """
-    data, _, _ = load_from_zip_file(path, device="cpu")
-    policy_class = (data or {}).get("policy_class", object)
-    for algorithm in ALGORITHMS.values():
-        if issubclass(policy_class, algorithm.policy_base):
-            return algorithm.load(path, device="cpu").policy
-    raise ValueError(
-        f"{path} holds a {policy_class.__name__}, which is no flow policy: export it as "
-        "Stable-Baselines3 documents."
-    )
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Export a policy from the command line.
-
-    :param arguments: Arguments of the command line; those of the process if not given.
-    """
-    parser = argparse.ArgumentParser(prog="python -m sb3_policyflow.export", description=__doc__)
-    parser.add_argument("model", help="the model's zip file")
-    parser.add_argument("output", help="the file to write, .onnx or .pt2")
-    parser.add_argument("--vecnormalize", metavar="PKL", help="what VecNormalize.save wrote")
-    parser.add_argument("--latents", action="store_true", help="make the latents an input")
-    options = parser.parse_args(arguments)
-    normalize = None
-    if options.vecnormalize is not None:
-        normalize = pickle.loads(Path(options.vecnormalize).read_bytes())
-    export(load_policy(options.model), options.output, normalize, options.latents)
-    sys.stdout.write(f"Wrote {options.output}\n")
-
-
-if __name__ == "__main__":
-    main()

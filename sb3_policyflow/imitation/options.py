@@ -1,0 +1,55 @@
+"""Options of cloning."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from sb3_policyflow.common import checks
+from sb3_policyflow.common.schedules import Coefficient, parse_schedule
+
+
+@dataclass(frozen=True)
+class CloningOptions:
+    """How a policy is cloned, see :func:`~sb3_policyflow.imitation.clone`.
+
+    >>> CloningOptions(gradient_steps=0).checked()
+    Traceback (most recent call last):
+    ...
+    ValueError: gradient_steps must be at least 1, and a whole number, got 0.
+    """
+
+    option_checks: ClassVar[Mapping[str, checks.Check]] = {
+        "gradient_steps": checks.at_least(1),
+        "batch_size": checks.at_least(1),
+        "learning_rate": parse_schedule,
+        "noise_std": checks.positive_or_none,
+        "validation_fraction": checks.between(0.0, 0.9),
+        "eval_freq": checks.at_least(1),
+        "patience": checks.or_none(checks.at_least(1)),
+    }
+
+    gradient_steps: int = 6000
+    batch_size: int = 1024
+    learning_rate: Coefficient = "lin_0.001"
+    noise_std: float | None = None
+    validation_fraction: float = 0.1
+    eval_freq: int = 200
+    patience: int | None = 15
+    seed: int | None = None
+    checkpoint: str | Path | None = None
+
+    def checked(self) -> "CloningOptions":
+        """These options.
+
+        :raises ValueError: If one cannot be used.
+        """
+        checks.check_options(self)
+        return self
+
+    def settings(self) -> dict[str, Any]:
+        """What a run must have in common with the one that it continues."""
+        return {
+            name: getattr(self, name)
+            for name in ("gradient_steps", "batch_size", "validation_fraction", "eval_freq", "seed")
+        }

@@ -1,0 +1,77 @@
+"""PolicyFlow's loss in one call of a kernel, in place of its formulas."""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch as th
+
+from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.losses import SURROGATES, clipped_surrogate
+from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.common.update import CompiledLoss, CompiledTerms
+from sb3_policyflow.flows import Interpolant
+from sb3_policyflow.kernels import KernelLoss, LossInputs, LossOptions
+
+if TYPE_CHECKING:  # that module imports this one
+    from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
+
+
+def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
+    """The loss of an update, as :meth:`~.FlowUpdate.loss` computes it.
+
+    :param update: The update, with the formulas of its class.
+    :return: None if it has terms that no kernel knows.
+    """
+    policy, interpolant, latent_std = update.policy, update.flow.interpolant, update.latent_std
+    has_known_formulas = (
+        SURROGATES[update.trust_region] is clipped_surrogate
+        and update.uniform_targets is None
+        and type(policy).values is FlowPolicy.values
+        and type(interpolant).brownian_residual is Interpolant.brownian_residual
+    )
+    clip_range = update.clip_range
+    if not has_known_formulas or not isinstance(clip_range, float):
+        return None
+    if isinstance(latent_std, th.Tensor):
+        return None
+    unbounded = math.inf
+    options = LossOptions(
+        end_time=interpolant.end_time,
+        latent_std=float(latent_std),
+        averages_shift=update.time_average == "shift",
+        clip_range=clip_range,
+        log_ratio_clamp=unbounded if update.log_ratio_clamp is None else update.log_ratio_clamp,
+        brownian_coef=update.brownian_coef,
+        sums_dimensions=update.brownian_reduction == "sum",
+        ent_coef=update.ent_coef,
+        vf_coef=update.vf_coef,
+        clip_range_vf=unbounded if update.clip_range_vf is None else update.clip_range_vf,
+    )
+    loss = KernelLoss(options, interpolant.score_coefficients)
+
+    def compiled_loss(
+        batch: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+    ) -> CompiledTerms | None:
+        inputs = LossInputs(
+            features=features,
+            critic_features=critic_features,
+            log_std=policy.noise_log_std,
+            times=batch.drawn.times,
+            points=batch.drawn.points,
+            reference_velocity=batch.drawn.reference_velocity,
+            actions=batch.actions,
+            endpoints=batch.record.endpoints,
+            advantages=batch.advantages,
+            old_values=batch.old_values,
+            returns=batch.returns,
+            old_log_std=update.reference_log_std,
+        )
+        evaluated = loss(policy, inputs)
+        if evaluated is None:
+            return None
+        means = evaluated.terms._asdict()
+        kl, maxima = th.tensor(means.pop("kl")), {"log_ratio_max": means.pop("log_ratio_max")}
+        means["entropy_loss"] = -means.pop("entropy")
+        return CompiledTerms(evaluated, kl, means, maxima)
+
+    return compiled_loss
