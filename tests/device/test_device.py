@@ -167,3 +167,13 @@ def test_dictionaries_of_observations_in_a_users_own_class(algorithm: type[Any])
         for env in (DictEnv(), VecMonitor(TensorEnvAdapter(DictEnv())))
     ]
     assert th.equal(weights(models[0]), weights(models[1]))
+
+
+def test_the_class_in_the_documentation() -> None:
+    page = Path(__file__).parents[2] / "docs" / "tensors.md"
+    blocks = page.read_text(encoding="utf-8").split("```python\n")[1:]
+    (block,) = [block.split("```")[0] for block in blocks if "class Reach" in block]
+    names: dict[str, Any] = {}
+    exec(block, names)
+    model = train(model_in(names["Reach"](N_ENVS)), 8 * N_ENVS * N_STEPS)
+    assert [episode["l"] for episode in model.ep_info_buffer] == [100] * N_ENVS
