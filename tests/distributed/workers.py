@@ -4,6 +4,7 @@ import hashlib
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,15 @@ def digest(model: Any) -> str:
 
 
 ALGORITHMS = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
+
+
+def each_algorithm(function: Callable[[Path, str], str], folder: Path) -> list[str]:
+    """What a function returns for each of the algorithms."""
+    results = []
+    for name in ALGORITHMS:
+        (folder / name).mkdir(exist_ok=True)
+        results.append(function(folder / name, name))
+    return results
 
 
 def run_whole(folder: Path, algorithm: str) -> str:
