@@ -1,5 +1,6 @@
 """Ranks that torch.distributed connects: gloo between CPUs, nccl between GPUs."""
 
+import atexit
 import functools
 import math
 import os
@@ -67,6 +68,7 @@ class ProcessGroup(Ranks):
                 if backend == "nccl":
                     _check_gpus()
                 _initialize(backend)
+                atexit.register(self._close)  # gloo's threads abort a process that leaves them
             self._store = _of_this_attempt(dist.distributed_c10d._get_default_store())
             self._control = dist.new_group(backend="gloo", timeout=ROLLOUT_TIMEOUT)
 
@@ -90,7 +92,11 @@ class ProcessGroup(Ranks):
                 self._store.set(SENTENCE, sentence)
         if self._shared_sum is not None:
             self._shared_sum.stop()
-        self._control = None
+        self._close()
+
+    def _close(self) -> None:
+        """Close the connections to the other ranks."""
+        self._control = self._store = None
         if dist.is_initialized():
             with suppress(RuntimeError):
                 dist.destroy_process_group()
