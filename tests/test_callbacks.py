@@ -168,7 +168,8 @@ def test_returns_of_drawn_and_deterministic_actions() -> None:
     env = make_vec_env(TwoWays, 2)
     diagnostics = FlowDiagnosticsCallback(eval_env=env, n_eval_episodes=40)
     collector = Collector()
-    with pytest.warns(UserWarning, match=r"Deterministic actions return 0 .* may lie betw") as told:
+    advice = r"Deterministic actions return 0 .* may be too few"
+    with pytest.warns(UserWarning, match=advice) as told:
         model.learn(96, [diagnostics, collector])
     assert len(told) == 1
     assert collector.logged[-1]["return_deterministic"] == 0

@@ -176,6 +176,8 @@ def check_networks(
     :param extractor_class: A features extractor's class, or None.
     :raises ValueError: With what to give instead.
     """
+    if isinstance(net_arch, list) and net_arch and isinstance(net_arch[0], dict):
+        net_arch = net_arch[0]  # the form before SB3 1.8, of which it warns
     parts = net_arch if isinstance(net_arch, dict) else {"pi": net_arch or []}
     sizes = [size for layers in parts.values() for size in _as_list(layers)]
     are_sizes = all(isinstance(size, Integral) and int(size) > 0 for size in sizes)

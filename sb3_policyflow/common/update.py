@@ -202,7 +202,9 @@ def _joined(values: list[Any]) -> th.Tensor:
     """Tensors and numbers as one tensor."""
     numbers = [value for value in values if not isinstance(value, th.Tensor)]
     tensors = [value for value in values if isinstance(value, th.Tensor)]
-    return th.hstack([*tensors, th.tensor(numbers)] if numbers else tensors)
+    if numbers:
+        tensors.append(th.tensor(numbers, dtype=th.float32, device="cpu"))
+    return th.hstack(tensors)
 
 
 def make_optimizer(

@@ -85,7 +85,7 @@ def _joined(steps: Sequence[tuple[Any, Any, Any]], last: Any, terminal: bool) ->
     return Episode(obs, np.stack(actions), np.array(rewards), terminal)
 
 
-def record(
+def record_episodes(
     model: BaseAlgorithm,
     env: VecEnv | None = None,
     n_episodes: int = 100,

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_policyflow.envs import ensure_registered
-from sb3_policyflow.imitation.episodes import record, save_episodes
+from sb3_policyflow.imitation.episodes import record_episodes, save_episodes
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     options = _parser().parse_args(arguments)
     model, env = _load(options)
-    episodes = record(model, env, options.episodes, options.deterministic)
+    episodes = record_episodes(model, env, options.episodes, options.deterministic)
     save_episodes(episodes, options.out, env, options.env)
     returns = [episode.rews.sum() for episode in episodes]
     sys.stdout.write(

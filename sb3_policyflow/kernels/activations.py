@@ -1,10 +1,12 @@
 """The activations that kernels know."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import nn
 
 RELU, LEAKY_RELU, ELU, TANH, SIGMOID, SILU, MISH = range(7)
+GELU, GELU_TANH, SOFTPLUS, HARDTANH, IDENTITY = range(7, 12)
 
 
 class Activation(NamedTuple):
@@ -14,17 +16,42 @@ class Activation(NamedTuple):
     alpha: float = 0.0
 
 
-PLAIN: dict[type[nn.Module], Activation] = {
-    nn.ReLU: Activation(RELU),
-    nn.Tanh: Activation(TANH),
-    nn.Sigmoid: Activation(SIGMOID),
-    nn.SiLU: Activation(SILU),
-    nn.Mish: Activation(MISH),
-}
-"""Those without a parameter."""
+class Known(NamedTuple):
+    """Attributes of a module, and the activation that it is with values of them, if any."""
 
-WITH_ALPHA: dict[type[nn.Module], tuple[int, str]] = {
-    nn.ELU: (ELU, "alpha"),
-    nn.LeakyReLU: (LEAKY_RELU, "negative_slope"),
+    attributes: tuple[str, ...]
+    activation: Callable[..., Activation | None]
+
+
+def _plain(kind: int) -> Known:
+    return Known((), lambda: Activation(kind))
+
+
+def _with_alpha(kind: int, name: str) -> Known:
+    return Known((name,), lambda alpha: Activation(kind, float(alpha)))
+
+
+def _softplus(beta: float, threshold: float) -> Activation | None:
+    return Activation(SOFTPLUS, float(beta)) if threshold == 20 else None
+
+
+def _hardtanh(low: float, high: float) -> Activation | None:
+    return Activation(HARDTANH) if (low, high) == (-1, 1) else None
+
+
+KNOWN: dict[type[nn.Module], Known] = {
+    nn.ReLU: _plain(RELU),
+    nn.LeakyReLU: _with_alpha(LEAKY_RELU, "negative_slope"),
+    nn.ELU: _with_alpha(ELU, "alpha"),
+    nn.Tanh: _plain(TANH),
+    nn.Sigmoid: _plain(SIGMOID),
+    nn.SiLU: _plain(SILU),
+    nn.Mish: _plain(MISH),
+    nn.GELU: Known(
+        ("approximate",), lambda kind: Activation(GELU_TANH if kind == "tanh" else GELU)
+    ),
+    nn.Softplus: Known(("beta", "threshold"), _softplus),
+    nn.Hardtanh: Known(("min_val", "max_val"), _hardtanh),
+    nn.Identity: _plain(IDENTITY),
 }
-"""Those with one, and the attribute that holds it."""
+"""The activations by their modules."""

@@ -10,7 +10,7 @@ from torch import nn
 from torch.utils._device import DeviceContext
 
 from sb3_policyflow.flows.folding import GLOBAL_HOOKS, HOOKS, has_hooks
-from sb3_policyflow.kernels.activations import PLAIN, WITH_ALPHA, Activation
+from sb3_policyflow.kernels.activations import KNOWN, Activation
 from sb3_policyflow.kernels.compiler import load_kernels, note_fallback
 from sb3_policyflow.kernels.layouts import Integers, Kernels
 
@@ -102,15 +102,18 @@ class ModuleInspector:
         :raises UnsupportedError: If they do not.
         """
         self.require_no_hooks(module)
-        if type(module) in PLAIN:
-            return PLAIN[type(module)]
-        if type(module) not in WITH_ALPHA:
-            known = ", ".join(kind.__name__ for kind in (*PLAIN, *WITH_ALPHA))
-            raise UnsupportedError(f"activation {type(module).__name__} is not among {known}")
-        kind, name = WITH_ALPHA[type(module)]
-        alpha = module.__dict__[name]
-        self._places.append((module.__dict__, name, alpha))
-        return Activation(kind, float(alpha))
+        if type(module) not in KNOWN:
+            names = ", ".join(kind.__name__ for kind in KNOWN)
+            raise UnsupportedError(f"activation {type(module).__name__} is not among {names}")
+        attributes, read = KNOWN[type(module)]
+        values = [module.__dict__[name] for name in attributes]
+        self._places += [
+            (module.__dict__, name, value) for name, value in zip(attributes, values, strict=True)
+        ]
+        activation = read(*values)
+        if activation is None:
+            raise UnsupportedError(f"activation {module} has other options than torch's defaults")
+        return activation
 
 
 class Parts(Protocol):

@@ -70,7 +70,8 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         if evaluated is None:
             return None
         means = evaluated.terms._asdict()
-        kl, maxima = th.tensor(means.pop("kl")), {"log_ratio_max": means.pop("log_ratio_max")}
+        kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
+        maxima = {"log_ratio_max": means.pop("log_ratio_max")}
         means["entropy_loss"] = -means.pop("entropy")
         return CompiledTerms(evaluated, kl, means, maxima)
 

@@ -269,10 +269,10 @@ def test_native_vector_environments_train_as_dummy_ones(algorithm: type[Any]) ->
 # PPO's own
 
 
-@pytest.mark.parametrize("clip_range_vf", [None, 0.2, -0.2, "lin_0.2"])
-def test_ppo(algorithm: type[Any], clip_range_vf: float | str | None) -> None:
-    if clip_range_vf in (-0.2, "lin_0.2"):
-        with pytest.raises(ValueError, match="clip_range_vf must be positive"):
+@pytest.mark.parametrize("clip_range_vf", [None, 0.2, -0.2])
+def test_ppo(algorithm: type[Any], clip_range_vf: float | None) -> None:
+    if clip_range_vf == -0.2:
+        with pytest.raises(ValueError, match="clip_range_vf must not be negative"):
             make(algorithm, clip_range_vf=clip_range_vf)
     else:
         model = train(make(algorithm, clip_range_vf=clip_range_vf), 64)

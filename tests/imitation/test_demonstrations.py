@@ -20,7 +20,7 @@ from sb3_policyflow.imitation import (
     Demonstrations,
     clone,
     load_demonstrations,
-    record,
+    record_episodes,
     save_episodes,
 )
 from sb3_policyflow.imitation.demonstrators import (
@@ -94,7 +94,7 @@ def test_what_is_nothing_of_this(source: Any, what: str) -> None:
 def test_a_recording(algorithm: type[Any]) -> None:
     env = make_vec_env("Pendulum-v1", n_envs=3, seed=0)
     model = algorithm("MlpPolicy", env, seed=0)
-    episodes = record(model, n_episodes=4, deterministic=True)
+    episodes = record_episodes(model, n_episodes=4, deterministic=True)
     assert [len(episode.acts) for episode in episodes] == [200] * 4
     assert not any(episode.terminal for episode in episodes)
     for episode in episodes:
@@ -111,7 +111,7 @@ def test_observations_are_recorded_before_they_are_normalized() -> None:
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, seed=0))
     model = PPO("MlpPolicy", env, n_steps=64, seed=0).learn(128)
     count = env.obs_rms.count  # type: ignore[union-attr]
-    episode = record(model, n_episodes=1, deterministic=True)[0]
+    episode = record_episodes(model, n_episodes=1, deterministic=True)[0]
     assert np.abs(np.linalg.norm(episode.obs[:, :2], axis=1) - 1).max() < 1e-5  # cosine and sine
     normalized = env.normalize_obs(episode.obs[:-1])
     acts = model.predict(normalized, deterministic=True)[0]
@@ -123,12 +123,12 @@ def test_where_a_recording_is_not_possible() -> None:
     model = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8)
     model.env = None
     with pytest.raises(ValueError, match="no environment to be recorded in"):
-        record(model)
+        record_episodes(model)
     image = gym.make("Pendulum-v1")
     image.observation_space = spaces.Box(0, 255, (36, 36, 3), np.uint8)
     wrapped = VecTransposeImage(VecNormalize(make_vec_env(lambda: image), norm_obs=False))
     with pytest.raises(ValueError, match="VecTransposeImage wraps the VecNormalize"):
-        record(model, wrapped)
+        record_episodes(model, wrapped)
 
 
 def test_a_clone_of_a_recording_acts_as_the_model_did() -> None:
@@ -136,7 +136,7 @@ def test_a_clone_of_a_recording_acts_as_the_model_did() -> None:
     model = PPO("MlpPolicy", env, seed=1, policy_kwargs={"log_std_init": -3.0})
     with th.no_grad():
         model.policy.action_net.weight.mul_(50)
-    episodes = record(model, n_episodes=8, deterministic=True)
+    episodes = record_episodes(model, n_episodes=8, deterministic=True)
     cloned = PolicyFlow("MlpPolicy", env, policy_kwargs=TINY, **SMALL)
     clone(cloned, episodes, gradient_steps=300, batch_size=256, learning_rate="lin_0.01")
     shown = load_demonstrations(episodes)

@@ -18,6 +18,12 @@ ACTIVATIONS: list[Any] = [
     nn.ReLU,
     nn.LeakyReLU,
     nn.Sigmoid,
+    nn.GELU,
+    lambda: nn.GELU(approximate="tanh"),
+    nn.Softplus,
+    lambda: nn.Softplus(beta=2),
+    nn.Hardtanh,
+    nn.Identity,
 ]
 SHAPES = [(1, 1, [8]), (2, 4, [256, 128, 64]), (3, 5, [24, 40]), (6, 17, [64, 64]), (9, 3, [7])]
 """Dimensions of action and features, and hidden layers."""

@@ -239,4 +239,4 @@ def test_numbers_of_activations_are_names_of_nothing_else() -> None:
     kinds = [ModuleInspector().activation(activation()) for activation in ACTIVATIONS]
     assert all(isinstance(kind, Activation) for kind in kinds)
     assert len(set(kinds)) == len(ACTIVATIONS)
-    assert np.unique([kind.kind for kind in kinds if kind]).tolist() == list(range(7))
+    assert np.unique([kind.kind for kind in kinds if kind]).tolist() == list(range(12))

@@ -11,6 +11,7 @@ from torch import nn
 from sb3_policyflow import DPPO, PolicyFlow
 from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels import reason_kernels_are_off
+from sb3_policyflow.kernels.activations import KNOWN
 
 
 def make_policy(algorithm: Any = PolicyFlow, **policy_kwargs: Any) -> Any:
@@ -68,10 +69,16 @@ def test_what_was_done_to_a_policy(change: Callable[[Any], object], reason: str)
     assert reason_kernels_are_off(policy) == reason
 
 
+@pytest.mark.parametrize("activation", [nn.Hardtanh(-2, 2), nn.Softplus(threshold=5)])
+def test_other_options_of_an_activation_than_torchs_defaults(activation: nn.Module) -> None:
+    reason = reason_kernels_are_off(make_policy(activation_fn=lambda: activation))
+    assert reason == f"activation {activation} has other options than torch's defaults"
+
+
 def test_what_a_policy_is_made_of() -> None:
-    known = "ReLU, Tanh, Sigmoid, SiLU, Mish, ELU, LeakyReLU"
-    reason = reason_kernels_are_off(make_policy(activation_fn=nn.GELU))
-    assert reason == f"activation GELU is not among {known}"
+    known = ", ".join(activation.__name__ for activation in KNOWN)
+    reason = reason_kernels_are_off(make_policy(activation_fn=nn.Softsign))
+    assert reason == f"activation Softsign is not among {known}"
     reason = reason_kernels_are_off(make_policy(net_arch={"pi": [8], "vf": []}))
     assert reason == "for the critic, a network has no hidden layers"
     assert reason_kernels_are_off(make_policy(net_arch={"pi": [], "vf": [8]})) == (

@@ -38,7 +38,7 @@ def train(algorithm: Any, **options: Any) -> th.Tensor:
         (PolicyFlow, {"policy_kwargs": MISH, "brownian_coef": 0.25, "ent_coef": 0.01}),
         (PolicyFlow, {"policy_kwargs": MISH, "time_sampler": "uniform", "n_times": 3}),
         (PolicyFlow, {"policy_kwargs": MISH, "interpolant": "trigflow", "clip_range_vf": 0.2}),
-        (PolicyFlow, {"policy_kwargs": {**MISH, "activation_fn": th.nn.GELU}}),
+        (PolicyFlow, {"policy_kwargs": {**MISH, "activation_fn": th.nn.Softsign}}),
         (FPO, {"policy_kwargs": MISH}),
         (DPPO, {"policy_kwargs": MISH}),
     ],

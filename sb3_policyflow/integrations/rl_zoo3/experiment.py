@@ -29,10 +29,12 @@ from sb3_policyflow.integrations.rl_zoo3.samplers import TASK, Task
 
 ZOO_KEYS = (
     "callback",
+    "demonstrations",
     "deterministic_eval",
     "env_kwargs",
     "env_wrapper",
     "frame_stack",
+    "imitation_kwargs",
     "monitor_kwargs",
     "n_envs",
     "n_timesteps",
@@ -124,8 +126,11 @@ def with_task(manager: Any) -> Callable[..., float]:
 
     @functools.wraps(objective)
     def run(trial: Any) -> float:
-        TASK.set(task)
-        return float(objective(trial))
+        before = TASK.set(task)
+        try:
+            return float(objective(trial))
+        finally:
+            TASK.reset(before)
 
     manager._preprocess_action_noise = note_task
     return run

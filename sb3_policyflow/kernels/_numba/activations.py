@@ -3,12 +3,25 @@
 All come down to one exponential, and differ from torch's by a few units in the last place.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 
 from sb3_policyflow.kernels._numba.options import F, exact
-from sb3_policyflow.kernels.activations import ELU, LEAKY_RELU, MISH, RELU, SILU, TANH
+from sb3_policyflow.kernels.activations import (
+    ELU,
+    GELU,
+    GELU_TANH,
+    HARDTANH,
+    IDENTITY,
+    LEAKY_RELU,
+    MISH,
+    RELU,
+    SILU,
+    SOFTPLUS,
+    TANH,
+)
 from sb3_policyflow.kernels.layouts import Floats
 
 
@@ -73,6 +86,37 @@ def _mish_parts(x: Any) -> Any:
 
 
 @exact
+def _normal_cdf(x: Any) -> Any:
+    """erfc(-x / sqrt(2)) / 2, with the Chebyshev fit of erfc in Numerical Recipes (1.2e-7)."""
+    z = abs(x) * F(0.70710678)
+    t = F(1.0) / (F(1.0) + F(0.5) * z)
+    p = t * F(0.17087277) - F(0.82215223)
+    p = p * t + F(1.48851587)
+    p = p * t - F(1.13520398)
+    p = p * t + F(0.27886807)
+    p = p * t - F(0.18628806)
+    p = p * t + F(0.09678418)
+    p = p * t + F(0.37409196)
+    p = p * t + F(1.00002368)
+    tail = F(0.5) * t * _exp(p * t - F(1.26551223) - z * z)
+    return F(1.0) - tail if x > F(0.0) else tail
+
+
+@exact
+def _gelu_parts(x: Any) -> Any:
+    """(tanh u, du/dx) with u = sqrt(2 / pi) (x + 0.044715 x^3): gelu(x) ~ x (1 + tanh u) / 2."""
+    square = F(0.044715) * x * x
+    u = F(0.79788456) * (x + square * x)
+    return _tanh(u), F(0.79788456) * (F(1.0) + F(3.0) * square)
+
+
+@exact
+def _softplus(x: Any, beta: Any) -> Any:
+    scaled = beta * x
+    return x if scaled > F(20.0) else math.log1p(_exp(scaled)) / beta
+
+
+@exact
 def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # one loop for each
     """Apply an activation in place."""
     if kind == MISH:
@@ -94,7 +138,20 @@ def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # on
     elif kind == ELU:
         for i in range(values.size):
             values[i] = _elu(values[i], alpha)
-    else:
+    elif kind == GELU:
+        for i in range(values.size):
+            values[i] *= _normal_cdf(values[i])
+    elif kind == GELU_TANH:
+        for i in range(values.size):
+            values[i] *= F(0.5) + F(0.5) * _gelu_parts(values[i])[0]
+    elif kind == SOFTPLUS:
+        for i in range(values.size):
+            values[i] = _softplus(values[i], alpha)
+    elif kind == HARDTANH:
+        for i in range(values.size):
+            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
+            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
+    elif kind != IDENTITY:
         for i in range(values.size):
             values[i] = _sigmoid(values[i])
 
@@ -135,6 +192,31 @@ def activate_with_derivatives(  # noqa: C901  # one loop for each
             y = _elu(values[i], alpha)
             derivatives[i] = F(1.0) if values[i] > F(0.0) else y + alpha
             values[i] = y
+    elif kind == GELU:
+        for i in range(values.size):
+            x = values[i]
+            below = _normal_cdf(x)
+            derivatives[i] = below + x * F(0.39894228) * _exp(F(-0.5) * x * x)
+            values[i] = x * below
+    elif kind == GELU_TANH:
+        for i in range(values.size):
+            x = values[i]
+            t, slope = _gelu_parts(x)
+            derivatives[i] = F(0.5) * (F(1.0) + t + x * (F(1.0) - t * t) * slope)
+            values[i] = x * (F(0.5) + F(0.5) * t)
+    elif kind == SOFTPLUS:
+        for i in range(values.size):
+            scaled = alpha * values[i]
+            derivatives[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
+            values[i] = _softplus(values[i], alpha)
+    elif kind == HARDTANH:
+        for i in range(values.size):
+            derivatives[i] = F(1.0) if abs(values[i]) < F(1.0) else F(0.0)
+            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
+            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
+    elif kind == IDENTITY:
+        for i in range(values.size):
+            derivatives[i] = F(1.0)
     else:
         for i in range(values.size):
             values[i] = _sigmoid(values[i])

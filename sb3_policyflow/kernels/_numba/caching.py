@@ -32,19 +32,31 @@ class KernelCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return what was compiled, or None; a file that cannot be read is one that is missing."""
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception as error:
             logger.debug("A compiled kernel cannot be read: %r.", error)
             with suppress(Exception):
                 self.flush()
-            return None
+            found = None
+        if found is None:
+            _announce("Compiling the CPU kernels, once after an installation: about 20 seconds.")
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled if there is room for it."""
         try:
             super().save_overload(sig, data)
         except Exception as error:
-            logger.debug("A compiled kernel cannot be kept: %r.", error)
+            _announce(
+                f"Compiled CPU kernels cannot be kept ({error}), and every process will compile "
+                "them: name a folder in the environment variable NUMBA_CACHE_DIR."
+            )
+
+
+@cache
+def _announce(what: str) -> None:
+    """Say something once."""
+    logger.warning(what)
 
 
 @cache

@@ -290,6 +290,6 @@ def test_the_user_is_told_of_a_deterministic_action_between_modes(
         experiment.learn(experiment.setup_experiment()[0])
     finally:
         del gym.registry["TwoWays-v0"]
-    told = [str(each.message) for each in recwarn if "may lie between" in str(each.message)]
+    told = [str(each.message) for each in recwarn if "may be too few" in str(each.message)]
     assert len(told) == deterministic
     assert all("-params deterministic_eval:False" in text for text in told)

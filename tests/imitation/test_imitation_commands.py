@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.imitation import load_demonstrations, record, save_episodes
+from sb3_policyflow.imitation import load_demonstrations, record_episodes, save_episodes
 from sb3_policyflow.imitation.__main__ import main as clone_command
 from sb3_policyflow.imitation.demonstrate import main as demonstrate_command
 from sb3_policyflow.imitation.record import main as record_command
@@ -35,7 +35,7 @@ def test_from_commands_to_a_better_policy(
     algo = ["--algo", "policyflow", "--env", "Pendulum-v1"]
     small = ["-params", "n_steps:64", "n_envs:2", "batch_size:32", "normalize:True"]
     env = make_vec_env("Pendulum-v1", n_envs=2, seed=0)
-    save_episodes(record(PPO("MlpPolicy", env, seed=0), n_episodes=2), "shown.npz", env)
+    save_episodes(record_episodes(PPO("MlpPolicy", env, seed=0), n_episodes=2), "shown.npz", env)
 
     clone_command(
         [
