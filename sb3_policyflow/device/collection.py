@@ -278,12 +278,14 @@ def advantages_of(
     :return: Shape (n_steps, n_envs).
     """
     rewards, values, starts = (stored[name] for name in ("rewards", "values", "episode_starts"))
-    advantages = th.empty_like(rewards)
-    following, continues = last_values, 1.0 - dones
+    following = th.cat([values[1:], last_values.unsqueeze(0)])
+    continues = 1.0 - th.cat([starts[1:], dones.unsqueeze(0)])
+    # All steps at once, but for the sum that runs backwards
+    deltas = rewards + buffer.gamma * following * continues - values
+    factors = buffer.gamma * buffer.gae_lambda * continues
     advantage = th.zeros_like(last_values)
-    for step in reversed(range(len(rewards))):
-        delta = rewards[step] + buffer.gamma * following * continues - values[step]
-        advantage = delta + buffer.gamma * buffer.gae_lambda * continues * advantage
-        advantages[step] = advantage
-        following, continues = values[step], 1.0 - starts[step]
-    return advantages
+    advantages = []
+    for delta, factor in zip(deltas.flip(0).unbind(), factors.flip(0).unbind(), strict=True):
+        advantage = delta + factor * advantage
+        advantages.append(advantage)
+    return th.stack(advantages[::-1])
