@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 )
 
 from sb3_policyflow.envs.type_aliases import Info
+from sb3_policyflow.envs.vector import row
 
 TensorObs = Any
 """A tensor (n, ...), or a dictionary of such tensors."""
@@ -104,7 +105,7 @@ class LazyInfos(Sequence[Info]):
         finals = map_observations(lambda values: values.cpu().numpy(), step.final_observations)
         successes = None if step.successes is None else step.successes.tolist()
         for k, index in enumerate(step.ended.tolist()):
-            final = map_observations(lambda values, k=k: values[k], finals)
+            final = row(finals, k)
             info: Info = {"terminal_observation": final, "TimeLimit.truncated": limits[k]}
             if successes is not None:
                 info["is_success"] = successes[k]
@@ -137,7 +138,8 @@ class TensorEnvAdapter(VecEnv):
         self._reset_options()
         self.episodes.zero_()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return _to_numpy(self.env.reset())
+        observations: VecEnvObs = _to_numpy(self.env.reset())
+        return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = th.as_tensor(actions, device=self.env.device)

@@ -265,8 +265,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
         # Files of SB3's own algorithms have none.
-        saved: ResumeState | None = model.__dict__.pop("resume_state", None)
-        state = None if saved is None else saved.of_rank(model.rank)
+        first: ResumeState | None = model.__dict__.pop("resume_state", None)
+        state = None if first is None else first.of_rank(model.rank)
         if not force_reset:
             model._continue_episodes(state)
         model._saved_observed = None if state is None else state.what_was_observed()
