@@ -269,7 +269,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         state = None if first is None else first.of_rank(model.rank)
         if not force_reset:
             model._continue_episodes(state)
-        model._saved_observed = None if state is None else state.what_was_observed()
+        model._saved_observed = None if first is None else first.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
