@@ -26,6 +26,7 @@ def test_merged_statistics_are_those_of_one_process_that_saw_everything() -> Non
     ("fault", "sentence"),
     [
         ("environment raises", "Rank 1 has stopped. RuntimeError: the simulator has crashed"),
+        ("reward is NaN", "Rank 1 has stopped. NotFiniteError: The environment's reward is not"),
         ("update raises", "Rank 1 has stopped. RuntimeError: out of memory"),
         ("killed", "Another rank is gone without a word"),
     ],
