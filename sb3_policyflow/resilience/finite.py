@@ -66,7 +66,9 @@ def check_rollout(buffer: RolloutBuffer, first_timestep: int) -> None:
     """
     advice = "lower the learning rate, and normalize observations and rewards with VecNormalize"
     for name in ("actions", "values", "advantages", "returns"):
-        values = th.as_tensor(getattr(buffer, name))
+        values = getattr(buffer, name)
+        if isinstance(values, np.ndarray):
+            values = th.from_numpy(values)  # on the CPU, whatever torch's default device is
         if not all_finite(values):
             array = values.cpu().numpy()
             finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
