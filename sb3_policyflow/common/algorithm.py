@@ -285,7 +285,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
             self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
         kept = self.rollout_buffer.values, self.rollout_buffer.returns
-        arrays = (th.as_tensor(each).cpu().numpy().flatten() for each in kept)
+        arrays = (th.as_tensor(each, device="cpu").numpy().flatten() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
         logged["explained_variance"] = explained_variance(*arrays)
         if hasattr(self.policy, "log_std"):
