@@ -89,7 +89,7 @@ def test_imported_from_an_archive(tmp_path: Path, no_home: dict[str, str]) -> No
             file.write(source, source.relative_to(tree))
     (_, reason), messages = use(archive, more="", **no_home)
     assert reason == "None"
-    assert "A compiled kernel cannot be kept" in messages
+    assert "Compiled CPU kernels cannot be kept" in messages
 
 
 @pytest.mark.slow
