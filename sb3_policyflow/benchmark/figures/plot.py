@@ -82,8 +82,15 @@ def _draw_curve(axes: Axes, results: Sequence[Result], mode: str, color: str, ma
             "there is no curve of them: keep trainings of different lengths in different folders."
         )
     estimate = over_seeds([returns for _, returns in curves])
-    line = {"color": color, "marker": marker, "markersize": 5, "linewidth": 1.8}
-    axes.plot(timesteps, estimate.value, label=run.name, **line)
+    axes.plot(
+        timesteps,
+        estimate.value,
+        color=color,
+        marker=marker,
+        markersize=5,
+        linewidth=1.8,
+        label=run.name,
+    )
     axes.set_xlim(left=0)
     if len(curves) > 1:
         axes.fill_between(
