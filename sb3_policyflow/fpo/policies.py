@@ -83,7 +83,7 @@ class FPOPolicy(FlowPolicy):
 
     def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
         """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
-        return draw_matching(self.flow.interpolant, endpoints)
+        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

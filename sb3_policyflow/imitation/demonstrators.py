@@ -73,12 +73,12 @@ MULTI_GOAL_STYLES = {
     "slow": Style(stiffness=1.0, damping=2.5, max_action=1.0),
     "noisy": Style(stiffness=6.0, damping=4.5, max_action=5.0, noise=1.0),
 }
-INDECISION = 0.5
+INDECISION = 1.0
 """Of goals further away than the nearest by this much, e times fewer are chosen."""
 
 
 class MultiGoalDemonstrator(Demonstrator):
-    """Goes to one of MultiGoal's six goals, which it chooses with probability ~ exp(-d / 0.5).
+    """Goes to one of MultiGoal's six goals, which it chooses with probability ~ exp(-d).
 
     d is the distance: from the center all six are alike, and far from it the nearest is chosen.
     """

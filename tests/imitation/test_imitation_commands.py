@@ -99,5 +99,5 @@ def test_what_rl_zoo3_cannot_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=what):
+    with pytest.raises((SystemExit, ValueError), match=what):
         experiment(hyperparams=hyperparams, **options).setup_experiment()

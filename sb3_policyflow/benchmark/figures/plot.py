@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -82,15 +83,8 @@ def _draw_curve(axes: Axes, results: Sequence[Result], mode: str, color: str, ma
             "there is no curve of them: keep trainings of different lengths in different folders."
         )
     estimate = over_seeds([returns for _, returns in curves])
-    axes.plot(
-        timesteps,
-        estimate.value,
-        color=color,
-        marker=marker,
-        markersize=5,
-        linewidth=1.8,
-        label=run.name,
-    )
+    line: dict[str, Any] = {"color": color, "marker": marker, "markersize": 5, "linewidth": 1.8}
+    axes.plot(timesteps, estimate.value, label=run.name, **line)
     axes.set_xlim(left=0)
     if len(curves) > 1:
         axes.fill_between(

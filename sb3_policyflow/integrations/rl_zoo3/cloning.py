@@ -30,21 +30,21 @@ class CloningBeforeTraining:
         """What rl_zoo3 makes of the other hyperparameters.
 
         :param hyperparams: Those of the YAML file and of the command line.
-        :raises ValueError: If demonstrations cannot be used here.
+        :raises SystemExit: If demonstrations cannot be used here: a command ends without traceback.
         """
         self._demonstrations = hyperparams.pop("demonstrations", None)
         options = hyperparams.pop("imitation_kwargs", None) or {}
         if not isinstance(options, dict):
-            raise ValueError(
+            raise SystemExit(
                 f"imitation_kwargs must be a dictionary of arguments of clone, got {options!r}."
             )
         self._options = options
         if options and self._demonstrations is None:
-            raise ValueError(
+            raise SystemExit(
                 "imitation_kwargs needs demonstrations: name a dataset, or leave it out."
             )
         if self._demonstrations is not None and self._manager.optimize_hyperparameters:
-            raise ValueError(
+            raise SystemExit(
                 "Trials of --optimize do not clone: leave out demonstrations, or clone first with "
                 "python -m sb3_policyflow.imitation."
             )
