@@ -35,6 +35,7 @@ ELSEWHERE = {
     "optuna-dashboard": "Optuna's",
     "pip": "the installer's",
     "tensorboard": "TensorBoard's",
+    "torchrun": "PyTorch's",
     "trackio": "trackio's",
 }
 """Programs that are not this package's, and whose."""

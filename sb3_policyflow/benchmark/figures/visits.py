@@ -17,7 +17,8 @@ from sb3_policyflow.envs.point_maze import GOAL_CELLS, START_CELL, cell_center, 
 
 SCALE_LIMITS = (0.01, 100.0)
 SCALE = LogNorm(*SCALE_LIMITS)
-COLORS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="#F2B8A0")
+UNVISITED = "#F2B8A0"
+COLORS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under=UNVISITED)
 
 
 def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
