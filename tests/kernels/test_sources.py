@@ -52,7 +52,7 @@ def use(path: Path, more: str = "model.learn(64)", **environment: str) -> tuple[
     )
     assert done.returncode == 0, done.stderr
     action, file, reason, size, end = done.stdout.split("\n")
-    assert float(action.strip("[]")) == 0.0
+    assert abs(float(action.strip("[]"))) < 0.4  # an untrained policy's
     assert file.startswith(str(path))
     assert int(size) == len((HYPERPARAMS / "policyflow.yml").read_text(encoding="utf-8"))
     assert end == ""
