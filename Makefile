@@ -4,7 +4,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+# Shows what it downloads, except in continuous integration.
+INSTALL := $(BIN)/python -m pip install $(if $(CI),--quiet) --disable-pip-version-check \
 	--constraint .ci/constraints.txt
 
 PLAYGROUND_TESTS := tests/envs/test_playground.py tests/envs/test_playground_tasks.py \
@@ -46,6 +47,7 @@ $(VENV)/docs-installed: EXTRAS := docs
 $(VENV)/playground-installed: EXTRAS := tests,playground
 
 $(VENV)/%-installed: pyproject.toml .ci/constraints.txt
+	@echo "Installing into $(VENV), once; this takes two minutes or so."
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) torch
 	$(INSTALL) --editable ".[$(EXTRAS)]"

@@ -15,7 +15,9 @@ BELOW: dict[str, set[str]] = {
     "flows": set(),
     "resilience": {"hints"},
     "kernels": {"flows"},
-    "common": {"flows", "hints", "kernels", "resilience"},
+    "device": {"envs", "resilience"},
+    "distributed": {"device", "resilience"},
+    "common": {"distributed", "flows", "hints", "kernels", "resilience"},
     **{name: {"common", "flows", "kernels"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},
@@ -23,6 +25,7 @@ BELOW: dict[str, set[str]] = {
     "integrations": {
         "algorithms",
         "callbacks",
+        "distributed",
         "envs",
         "hints",
         "imitation",

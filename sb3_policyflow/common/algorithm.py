@@ -27,11 +27,11 @@ from sb3_policyflow.common.update import (
     clip_gradients,
     take_step,
 )
+from sb3_policyflow.distributed.algorithm import DistributedOnPolicyAlgorithm
 from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
-from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
-class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
+class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
@@ -66,7 +66,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
-    unsaved = (*ResilientOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
+    unsaved = (*DistributedOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
     trust_region: str = "ppo"
@@ -144,9 +144,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
-            ent_coef=ent_coef,  # type: ignore[arg-type]  # may be a schedule here
+            ent_coef=ent_coef,
             vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]  # None turns clipping off
+            max_grad_norm=max_grad_norm,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             rollout_buffer_class=rollout_buffer_class,
@@ -218,8 +218,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         # An actor that does not learn gives no reason to learn faster.
         if self.adaptive_learning_rate is None or not trains_actor:
             return
+        kl = self.ranks.mean(th.stack(kls).mean())
         self.adaptive_learning_rate = rule.adapt(
-            self.adaptive_learning_rate, th.stack(kls).mean().item(), self.value_of("desired_kl")
+            self.adaptive_learning_rate, kl, self.value_of("desired_kl")
         )
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
@@ -238,12 +239,12 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             kls = [] if rule.window == "epoch" else kls
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
-            for batch in self.rollout_buffer.minibatches(samples, self.batch_size):  # line 14
+            for batch in self.rollout_buffer.minibatches(samples, update.batch_size):  # line 14
                 advantages = self._normalized(batch.advantages, "minibatch")
                 # Lines 18 to 21: ratio, surrogate objective, regularizers, error of the values
                 loss, kl = update.loss(batch._replace(advantages=advantages), metrics)
                 kls.append(kl)
-                stop = self.target_kl is not None and kl.item() > 1.5 * self.target_kl
+                stop = self.target_kl is not None and self.ranks.mean(kl) > 1.5 * self.target_kl
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
@@ -260,10 +261,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
         """Advantages, shape (n,), normalized if this is the scope in which that is done."""
-        # One sample has no standard deviation.
-        if self.normalize_advantage and self.advantage_scope == scope and len(advantages) > 1:
-            return (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        return advantages
+        is_due = self.normalize_advantage and self.advantage_scope == scope
+        return self.ranks.normalized(advantages) if is_due else advantages
 
     def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.
@@ -274,8 +273,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             parameter.grad = None
         trained = None if trains_actor else list(self.policy.critic_parameters())
         loss.backward(inputs=trained)
+        mean_loss = self.ranks.average_gradients(parameters, loss.item())
         norm = clip_gradients(parameters, self.max_grad_norm)
-        check_step(loss.item(), norm, self.num_timesteps, self.divergence_advice)
+        check_step(mean_loss, norm, self.num_timesteps, self.divergence_advice)
         take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
 
@@ -284,20 +284,21 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
             self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
-        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
+        kept = self.rollout_buffer.values, self.rollout_buffer.returns
+        arrays = (th.as_tensor(each, device="cpu").numpy().flatten() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}
-        logged["explained_variance"] = explained_variance(values.flatten(), returns.flatten())
+        logged["explained_variance"] = explained_variance(*arrays)
         if hasattr(self.policy, "log_std"):
             logged["std"] = self.policy.log_std.exp().mean().item()
         for name in ("clip_range", "clip_range_vf"):
             if getattr(self, name) is not None:
                 logged[name] = self.value_of(name)
-        for name, value in {**metrics.summary(), **logged}.items():
+        for name, value in self.ranks.average_metrics({**metrics.summary(), **logged}).items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        """Save the model; see :meth:`ResilientOnPolicyAlgorithm.save`."""
+        """Save the model; see :meth:`DistributedOnPolicyAlgorithm.save`."""
         options.note_changed_options(self)
         self.read_learning_rate()
         super().save(path, exclude, include)

@@ -277,7 +277,7 @@ def check_algorithm(model: Any) -> None:
             )
     check_values(model)
     if not is_loaded:
-        checks.warn_of_batches(model.batch_size, model.n_steps, model.n_envs)
+        checks.warn_of_batches(model.batch_size, model.n_steps, model.ranks.size * model.n_envs)
 
 
 def check_values(model: Any) -> None:

@@ -75,7 +75,7 @@ class FlowUpdate(ABC):
         bounds_values = algorithm.clip_range_vf is not None
         self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
         self.compiled_loss: CompiledLoss | None = None
-        self.batch_size: int = algorithm.batch_size
+        self.batch_size: int = algorithm.ranks.share("batch_size", algorithm.batch_size)
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
         self.log_ratio_clamp: float | None = None

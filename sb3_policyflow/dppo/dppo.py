@@ -40,8 +40,9 @@ class DPPOUpdate(FlowUpdate):
         super().__init__(algorithm, rollout)
         self.log_prob_clamp = algorithm.log_prob_clamp
         self.log_prob_reduction = algorithm.log_prob_reduction
+        n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
         self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
+            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, n_states
         )
         self.stds = self.policy.log_prob_stds
         n_steps = len(self.stds)

@@ -1,5 +1,6 @@
 """FPO: PPO with the change of a flow-matching loss in place of that of a likelihood."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -54,8 +55,9 @@ class FPOUpdate(FlowUpdate):
         super().__init__(algorithm, rollout)
         policy = algorithm.policy
         self.algorithm = algorithm
+        n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
         self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, algorithm.n_entropy_states
+            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, n_states
         )
         n_samples, action_dim = rollout.actions.shape
         sampler = TIME_SAMPLERS[algorithm.time_sampler](policy.flow.times())

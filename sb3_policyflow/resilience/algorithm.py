@@ -19,6 +19,7 @@ from sb3_policyflow.resilience.collection import (
     PendingBonus,
     StepChecks,
     rollback_statistics,
+    statistics_of,
     terminal_observations,
     time_limits,
 )
@@ -60,10 +61,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     former_values: ClassVar[Mapping[str, Any]] = {}
     """Values of attributes that files of earlier versions do not have."""
     unsaved: ClassVar[tuple[str, ...]] = (
-        "_callback",
-        "_step_checks",
-        "_saved_random_states",
-        "_saved_observed",
+        *("_callback", "_step_checks", "_saved_random_states", "_saved_observed"),
     )
     """Attributes that no file has."""
 
@@ -72,6 +70,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     _step_checks: StepChecks
     _saved_random_states: RandomStates | None = None
     """Those with which the next ``learn`` continues. A model that only predicts keeps them."""
+    rank: int = 0
+    """Which of the processes that train this model this one is."""
+    other_resume_states: tuple[ResumeState, ...] = ()
+    """Those of the processes after the first, which saves the model."""
 
     _saved_observed: Observed | None = None
     """What a file says of the observations in the training that it is from."""
@@ -129,12 +131,18 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         try:
             with self._guarded():
                 self._callback = callback
-                complete = super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+                complete = self._collect(env, callback, rollout_buffer, n_rollout_steps)
         finally:
             self._callback = None
         if complete:
             check_rollout(rollout_buffer, first_timestep)
         return complete
+
+    def _collect(
+        self, env: VecEnv, callback: BaseCallback, buffer: RolloutBuffer, n_steps: int
+    ) -> bool:
+        """SB3's own loop."""
+        return super().collect_rollouts(env, callback, buffer, n_steps)
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
@@ -185,12 +193,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         :param exclude: Attributes not to save, such as "resume_state".
         :param include: Attributes to save that SB3 leaves out.
         """
-        normalize = self.get_vec_normalize_env()
-        # SB3 saves the attributes that it finds.
-        self.resume_state = ResumeState(
-            random_states=self._saved_random_states or RandomStates.now(self.device),
-            normalized_returns=None if normalize is None else normalize.returns.copy(),
-            observed=self.observed(),
+        # SB3 saves the attributes that it finds, the last observations of this process too.
+        state = self.own_resume_state()._replace(last_obs=None, last_episode_starts=None)
+        self.resume_state = state._replace(
+            observed=self.observed(), others=self.other_resume_states
         )
         try:
             if isinstance(path, (str, pathlib.Path)):
@@ -200,6 +206,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 super().save(path, exclude, include)
         finally:
             del self.resume_state
+
+    def own_resume_state(self) -> ResumeState:
+        """What this process needs to go on as it would have."""
+        normalize = self.get_vec_normalize_env()
+        return ResumeState(
+            random_states=self._saved_random_states or RandomStates.now(self.device),
+            normalized_returns=None if normalize is None else normalize.returns.copy(),
+            last_obs=self._last_obs,
+            last_episode_starts=self._last_episode_starts,
+            statistics=statistics_of(normalize),
+        )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self.unsaved]
@@ -248,10 +265,11 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs
             )
         # Files of SB3's own algorithms have none.
-        state: ResumeState | None = model.__dict__.pop("resume_state", None)
+        first: ResumeState | None = model.__dict__.pop("resume_state", None)
+        state = None if first is None else first.of_rank(model.rank)
         if not force_reset:
             model._continue_episodes(state)
-        model._saved_observed = None if state is None else state.what_was_observed()
+        model._saved_observed = None if first is None else first.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
         return model
@@ -274,6 +292,13 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
 
     def _continue_episodes(self, state: ResumeState | None) -> None:
         """Check an environment that is not reset against the last observations."""
+        if self.rank > 0:
+            if state is None or state.last_episode_starts is None:
+                raise ValueError(
+                    f"The file has no last observations of rank {self.rank}, which cannot "
+                    "continue in the middle of its episodes: leave out force_reset=False."
+                )
+            self._last_obs, self._last_episode_starts = state.last_obs, state.last_episode_starts
         if self.env is None or self._last_episode_starts is None:
             return
         n_saved = len(self._last_episode_starts)

@@ -164,6 +164,15 @@ def terminal_observations(infos: Infos, indices: list[int], space: spaces.Space[
     return batch(observations, space)
 
 
+def statistics_of(normalize: VecNormalize | None) -> dict[str, Any]:
+    """The attributes of ``VecNormalize`` that are running statistics, as they are.
+
+    :param normalize: The wrapper; without one there are none.
+    """
+    names = ("obs_rms", "ret_rms")
+    return {name: getattr(normalize, name) for name in names if hasattr(normalize, name)}
+
+
 @contextmanager
 def rollback_statistics(normalize: VecNormalize | None) -> Iterator[None]:
     """Undo what a number that is not finite has done to running statistics.
@@ -172,8 +181,9 @@ def rollback_statistics(normalize: VecNormalize | None) -> Iterator[None]:
 
     :param normalize: The environment's wrapper, if it has one.
     """
-    names = ("obs_rms", "ret_rms", "returns")
-    kept = {name: deepcopy(getattr(normalize, name, None)) for name in names}
+    kept = deepcopy(statistics_of(normalize))
+    if normalize is not None:
+        kept["returns"] = normalize.returns.copy()
     try:
         yield
     except FloatingPointError:

@@ -1,8 +1,10 @@
 """Numbers that are not finite, found before they reach the parameters."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
 
@@ -43,19 +45,32 @@ def check_finite(
     )
 
 
+def all_finite(values: th.Tensor) -> bool:
+    """Whether no number is infinite or NaN.
+
+    >>> all_finite(th.tensor([1.0, 2.0])), all_finite(th.tensor([1.0, th.inf]))
+    (True, False)
+    """
+    # The sum of finite numbers is finite but for overflow, and takes less time.
+    return math.isfinite(values.sum()) or bool(values.isfinite().all())
+
+
 def check_rollout(buffer: RolloutBuffer, first_timestep: int) -> None:
     """Stop at actions, values or advantages of a complete rollout that are not finite.
 
     The environment has seen the actions clipped to their bounds.
 
-    :param buffer: The rollout, with arrays of shape (n_steps, n_envs, ...).
+    :param buffer: The rollout, with arrays or tensors of shape (n_steps, n_envs, ...).
     :param first_timestep: Timesteps before it.
     :raises FloatingPointError: With the first step and environment concerned.
     """
     advice = "lower the learning rate, and normalize observations and rewards with VecNormalize"
     for name in ("actions", "values", "advantages", "returns"):
-        array = getattr(buffer, name)
-        if not np.isfinite(array).all():
+        values = getattr(buffer, name)
+        if isinstance(values, np.ndarray):
+            values = th.from_numpy(values)  # on the CPU, whatever torch's default device is
+        if not all_finite(values):
+            array = values.cpu().numpy()
             finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
             step = np.flatnonzero(~finite)[0]
             timestep = first_timestep + (int(step) + 1) * buffer.n_envs

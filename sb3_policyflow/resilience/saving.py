@@ -3,7 +3,7 @@
 import functools
 import inspect
 import random
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -65,11 +65,26 @@ class ResumeState(NamedTuple):
     """Random states, and what ``VecNormalize`` leaves out of its own ``save``.
 
     ``normalized_returns`` are its running discounted returns, shape (n_envs,); None without it.
+    Where several processes train the model, ``others`` has the states of all but the first, with
+    their last observations and episode starts. A run that is restarted goes on by itself with
+    ``statistics``, the attributes of ``VecNormalize`` that are running statistics.
     """
 
     random_states: RandomStates
     normalized_returns: np.ndarray | None
     observed: Observed | None = None
+    last_obs: Any = None
+    last_episode_starts: np.ndarray | None = None
+    others: "tuple[ResumeState, ...]" = ()
+    statistics: Mapping[str, Any] | None = None
+
+    def of_rank(self, rank: int) -> "ResumeState | None":
+        """What a process finds in the file; None if fewer have trained the model.
+
+        :param rank: Its number.
+        """
+        states = (self, *self.others)
+        return states[rank] if rank < len(states) else None
 
     def what_was_observed(self) -> Observed | None:
         """What the policy observed; None if it was what the policy's own space says."""

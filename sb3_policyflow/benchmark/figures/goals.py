@@ -10,7 +10,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 
 from sb3_policyflow.benchmark.figures.style import DPI, GRAY, PALE
-from sb3_policyflow.benchmark.measure.goals import Trajectories, goal_report
+from sb3_policyflow.benchmark.measure.goals import Trajectories, goal_counts, goal_report
 from sb3_policyflow.envs.drawing import GOAL_COLORS, INK
 from sb3_policyflow.envs.multigoal.point_masses import GOALS, WALL
 
@@ -45,8 +45,13 @@ def _draw_workspace(axes: Axes) -> None:
     axes.axis("off")
 
 
-def draw_goal_counts(axes: Axes, trajectories: Trajectories) -> None:
-    """Draw a bar for each goal's number of trajectories, in its color; dashed: all alike."""
+def draw_goal_counts(axes: Axes, trajectories: Trajectories, top: float | None = None) -> None:
+    """Draw a bar for each goal's number of trajectories, in its color; dashed: all alike.
+
+    :param axes: Where to draw.
+    :param trajectories: The trajectories.
+    :param top: Where the axis ends, to compare panels; by default at the highest bar.
+    """
     report = goal_report(trajectories)
     n = len(trajectories.lengths)
     places = range(len(GOALS))
@@ -54,7 +59,7 @@ def draw_goal_counts(axes: Axes, trajectories: Trajectories) -> None:
     axes.set_xticks(places, [str(count) for count in report.counts])
     axes.tick_params(length=0, labelsize=7.5, labelcolor=INK, pad=2)
     axes.axhline(n / len(GOALS), color=GRAY, linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
-    axes.set(ylim=(0, 1.08 * max(n / len(GOALS), *report.counts)), yticks=[])
+    axes.set(ylim=(0, top or 1.08 * max(n / len(GOALS), *report.counts)), yticks=[])
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.spines["bottom"].set_color(PALE)
     axes.set_xlabel(
@@ -73,15 +78,24 @@ def goals_figure(runs: Mapping[str, Trajectories], n_columns: int = 3) -> Figure
     """
     n_columns = min(n_columns, len(runs))
     n_rows = -(-len(runs) // n_columns)
-    figure = Figure(figsize=(3.1 * n_columns, 4.05 * n_rows), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(3.1 * n_columns, 4.05 * n_rows + 0.3), dpi=DPI, layout="constrained")
+    figure.supxlabel(
+        "Gray: at no goal. Bars: trajectories that end"
+        f"{chr(10) if n_columns == 1 else ' '}at each goal; dashed: all goals alike.",
+        fontsize=8,
+        color=INK,
+    )
+    # One scale of bars for all panels.
+    counts = [max(goal_counts(t).max(), len(t.lengths) / len(GOALS)) for t in runs.values()]
+    top = 1.08 * float(max(counts))
     panels = np.ravel(figure.subfigures(n_rows, n_columns, squeeze=False))
     for panel, (title, trajectories) in zip(panels, runs.items(), strict=False):
-        _draw_panel(panel, title, trajectories)
+        _draw_panel(panel, title, trajectories, top)
     return figure
 
 
-def _draw_panel(panel: SubFigure, title: str, trajectories: Trajectories) -> None:
+def _draw_panel(panel: SubFigure, title: str, trajectories: Trajectories, top: float) -> None:
     upper, lower = panel.subplots(2, 1, height_ratios=[5, 1])
     draw_trajectories(upper, trajectories)
-    draw_goal_counts(lower, trajectories)
+    draw_goal_counts(lower, trajectories, top)
     upper.set_title(title, fontsize=10, color=INK)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +17,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sb3_policyflow.benchmark.errors import BenchmarkError
-from sb3_policyflow.benchmark.figures.style import DPI, GRAY, SERIES_COLORS, style_curves
+from sb3_policyflow.benchmark.figures.style import (
+    DPI,
+    GRAY,
+    SERIES_COLORS,
+    series_styles,
+    style_curves,
+)
 from sb3_policyflow.benchmark.measure.evaluation import MODES, STOCHASTIC
 from sb3_policyflow.benchmark.report.statistics import (
     MIN_SEEDS,
@@ -45,24 +52,27 @@ def curves_figure(results: Sequence[Result], mode: str = STOCHASTIC) -> Figure:
     :raises BenchmarkError: If the seeds of a name were evaluated at different timesteps.
     """
     envs, names = distinct(results, "env"), distinct(results, "name")
-    colors = [SERIES_COLORS[i % len(SERIES_COLORS)] for i in range(len(names))]
+    styles = series_styles(names)
     n_columns = min(MOST_COLUMNS, math.ceil(math.sqrt(len(envs))))
     n_rows = -(-len(envs) // n_columns)
     figure = Figure(figsize=(4.2 * n_columns, 3.2 * n_rows), dpi=DPI, layout="constrained")
     panels = np.ravel(figure.subplots(n_rows, n_columns, squeeze=False))
     for axes, env in zip(panels, envs, strict=False):
-        for name, color in zip(names, colors, strict=True):
-            _draw_curve(axes, select(results, name, env), mode, color)
+        for name, style in styles.items():
+            _draw_curve(axes, select(results, name, env), mode, *style)
         style_curves(axes, env)
     for axes in panels[len(envs) :]:
         axes.set_visible(False)
     if len(names) > 1:
-        lines = [Line2D([], [], color=color, linewidth=1.8) for color in colors]
+        lines = [
+            Line2D([], [], color=color, marker=marker, markersize=5, linewidth=1.8)
+            for color, marker in styles.values()
+        ]
         figure.legend(lines, names, loc="outside lower center", ncols=len(names), frameon=False)
     return figure
 
 
-def _draw_curve(axes: Axes, results: Sequence[Result], mode: str, color: str) -> None:
+def _draw_curve(axes: Axes, results: Sequence[Result], mode: str, color: str, marker: str) -> None:
     curves = [curve for result in results if (curve := result.returns(mode))[0]]
     if not curves:
         return
@@ -73,10 +83,12 @@ def _draw_curve(axes: Axes, results: Sequence[Result], mode: str, color: str) ->
             "there is no curve of them: keep trainings of different lengths in different folders."
         )
     estimate = over_seeds([returns for _, returns in curves])
-    axes.plot(timesteps, estimate.value, color=color, linewidth=1.8, label=run.name)
+    line: dict[str, Any] = {"color": color, "marker": marker, "markersize": 5, "linewidth": 1.8}
+    axes.plot(timesteps, estimate.value, label=run.name, **line)
+    axes.set_xlim(left=0)
     if len(curves) > 1:
         axes.fill_between(
-            timesteps, estimate.low, estimate.high, color=color, alpha=0.18, linewidth=0
+            timesteps, estimate.low, estimate.high, color=color, alpha=0.13, linewidth=0
         )
 
 

@@ -4,6 +4,8 @@ Figures are Matplotlib's ``Figure``, made without ``pyplot``, so that no global 
 ``figure.savefig("name.png")`` writes one.
 """
 
+from collections.abc import Sequence
+
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
@@ -14,6 +16,30 @@ GRAY = "#9aa0a8"
 PALE = "#d9dce1"
 # Okabe and Ito's palette in the order in which it separates best on white.
 SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+OF_ALGORITHMS = {
+    "ppo": ("#E69F00", "s"),
+    "policyflow": ("#0072B2", "o"),
+    "fpo": ("#D55E00", "^"),
+    "dppo": ("#009E73", "D"),
+}
+"""Color and marker of each algorithm, in every figure."""
+OF_VARIANTS = ("#56B4E9", "v"), ("#CC79A7", "P"), ("#999999", "X")
+"""Those of other names: variants of an algorithm, such as "policyflow-latent0.3"."""
+
+
+def series_styles(names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Color and marker of each name; an algorithm's own are the same in every figure.
+
+    >>> series_styles(["ppo", "policyflow-latent0.3"])["ppo"]
+    ('#E69F00', 's')
+
+    :param names: Names of results, in the order of the figure.
+    """
+    others = [name for name in names if name not in OF_ALGORITHMS]
+    free = {name: OF_VARIANTS[i % len(OF_VARIANTS)] for i, name in enumerate(others)}
+    return {name: OF_ALGORITHMS.get(name) or free[name] for name in names}
 
 
 def style_curves(axes: Axes, title: str) -> None:

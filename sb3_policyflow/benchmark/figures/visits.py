@@ -17,7 +17,7 @@ from sb3_policyflow.envs.point_maze import GOAL_CELLS, START_CELL, cell_center, 
 
 SCALE_LIMITS = (0.01, 100.0)
 SCALE = LogNorm(*SCALE_LIMITS)
-COLORS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="white")
+COLORS = colormaps["YlGnBu"].with_extremes(bad=MARGIN, under="#F2B8A0")
 
 
 def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
@@ -38,14 +38,14 @@ def density_figure(runs: Mapping[str, VisitMap | Sequence[VisitMap]]) -> Figure:
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_xlabel(label, fontsize=8, color=INK)
     bar = figure.colorbar(ScalarMappable(SCALE, COLORS), ax=panels, shrink=0.75, aspect=24)
-    bar.set_label("visits relative to uniform", fontsize=8, color=INK)
+    bar.set_label("visits relative to uniform (red: none)", fontsize=8, color=INK)
     bar.ax.tick_params(which="both", labelsize=7, labelcolor=INK, length=0)
     bar.outline.set_visible(False)
     return figure
 
 
 def _draw_density(axes: Axes, density: NDArray[np.float64]) -> None:
-    """Walls gray, unvisited cells white; what is off the scale gets its nearest color."""
+    """Walls gray, unvisited cells red; what is off the scale gets its nearest color."""
     visited = density.clip(*SCALE_LIMITS)
     shown = np.where(density > 0, visited, np.where(np.isnan(density), np.nan, 1e-9))
     half = len(density) * CELL_SIZE / 2

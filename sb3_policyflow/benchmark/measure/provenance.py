@@ -60,6 +60,7 @@ def machine() -> dict[str, Any]:
     """The machine, and the versions."""
     return {
         "processor": _processor(),
+        "avx512": " avx512f " in _cpuinfo(),
         "cores": os.cpu_count(),
         "torch_threads": th.get_num_threads(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
@@ -68,8 +69,12 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
+def _cpuinfo() -> str:
     path = Path("/proc/cpuinfo")
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def _processor() -> str:
+    lines = _cpuinfo().splitlines()
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor()

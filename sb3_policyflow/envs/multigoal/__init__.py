@@ -6,5 +6,12 @@ from sb3_policyflow.envs.multigoal.environments import (
     MultiGoalVecEnv,
     MultiGoalVectorEnv,
 )
+from sb3_policyflow.envs.multigoal.tensors import MultiGoalTensorEnv
 
-__all__ = ["MultiGoalEnv", "MultiGoalState", "MultiGoalVecEnv", "MultiGoalVectorEnv"]
+__all__ = [
+    "MultiGoalEnv",
+    "MultiGoalState",
+    "MultiGoalTensorEnv",
+    "MultiGoalVecEnv",
+    "MultiGoalVectorEnv",
+]

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_policyflow.distributed.ranks import current
 from sb3_policyflow.integrations.isaaclab.checkpoint import Checkpoint, read_checkpoint
 from sb3_policyflow.integrations.isaaclab.lab import (
     Configured,
@@ -102,7 +103,13 @@ def run(configured: Configured, options: argparse.Namespace) -> PolicyFlow:
     :param configured: The task; its configuration is changed in place.
     :param options: The parsed command line, with the :class:`Checkpoint` that it names.
     :return: The trained model.
+    :raises LabError: If torchrun has started several processes.
     """
+    if current().size > 1:
+        raise LabError(
+            "This command trains in one process: start it without torchrun. In a script of your "
+            "own, each process makes its environment and calls learn, see docs/distributed.md."
+        )
     config = configured.env
     if options.num_envs is not None:
         config.scene.num_envs = options.num_envs

@@ -24,6 +24,7 @@ from sb3_policyflow.callbacks import warn_of_deterministic_actions
 from sb3_policyflow.envs.native import has_own_vectorization, make_native_vec_env
 from sb3_policyflow.hints import did_you_mean
 from sb3_policyflow.integrations.rl_zoo3.cloning import CloningBeforeTraining
+from sb3_policyflow.integrations.rl_zoo3.ranks import share_experiment
 from sb3_policyflow.integrations.rl_zoo3.samplers import TASK, Task
 
 ZOO_KEYS = (
@@ -62,6 +63,7 @@ def extend_experiment(manager: Any, own_algorithms: Container[str], config_given
         manager.vec_env_class = make_native_vec_env
     read_own_keys(manager)
     if is_own_algorithm:
+        share_experiment(manager)
         manager.objective = prune_if_diverged(with_task(manager))
         manager.learn = warn_of_deterministic_evaluation(manager)
         if manager.optimize_hyperparameters and manager.storage:

@@ -1,5 +1,6 @@
 """IsaacLab's script and presets, on fakes of its versions 2 and 3."""
 
+import argparse
 import importlib
 import json
 import os
@@ -14,7 +15,7 @@ from fakes import EACH, FAKES, SMALL, TASKS, assert_refused
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.integrations.isaaclab import lab, presets
-from sb3_policyflow.integrations.isaaclab.train import main, read_agent
+from sb3_policyflow.integrations.isaaclab.train import main, read_agent, run
 
 
 def run_script(version: str | None, folder: Path, *arguments: str) -> str:
@@ -184,3 +185,12 @@ def test_numbers_of_timesteps() -> None:
     without = {key: value for key, value in presets.quadcopter().items() if key != "n_timesteps"}
     with pytest.raises(lab.LabError, match="have no n_timesteps: give --max_iterations"):
         read_agent(without, 64, None, None)
+
+
+def test_several_processes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1"}
+    for name, value in started.items():
+        monkeypatch.setenv(name, value)
+    configured, options = lab.Configured({}, None), argparse.Namespace()
+    with pytest.raises(lab.LabError, match="start it without torchrun"):
+        run(configured, options)

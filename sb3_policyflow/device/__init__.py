@@ -1,0 +1,1 @@
+"""Rollouts that stay on the device, from environments whose steps are tensors."""

@@ -1,0 +1,85 @@
+"""What ranks agree on, how they end together, and who writes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from tests.distributed import workers
+from tests.distributed.launch import run_ranks
+
+pytestmark = pytest.mark.slow
+
+
+def test_merged_statistics_are_those_of_one_process_that_saw_everything() -> None:
+    one = workers.recorded_statistics(n_envs=4)
+    for several in run_ranks(4, workers.recorded_statistics, 4):
+        for merged, whole in zip(several, one, strict=True):
+            for ours, theirs in zip(merged, whole, strict=True):
+                np.testing.assert_allclose(ours, theirs, rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        ("environment raises", "Rank 1 has stopped. RuntimeError: the simulator has crashed"),
+        ("reward is NaN", "Rank 1 has stopped. NotFiniteError: The environment's reward is not"),
+        ("update raises", "Rank 1 has stopped. RuntimeError: out of memory"),
+        ("killed", "Another rank is gone without a word"),
+    ],
+)
+def test_a_fault_of_one_rank_ends_the_others_with_its_sentence(fault: str, sentence: str) -> None:
+    first, second, third = run_ranks(3, workers.run_with_fault, fault)
+    for message, _, is_finite in (first, third):
+        assert message.startswith(f"RankError: {sentence}"), message
+        assert is_finite
+    if fault == "killed":
+        assert second is None
+    else:
+        assert second[0].split(": ", 1)[1] in first[0]
+
+
+def test_a_loss_that_is_not_finite_ends_all_before_the_step() -> None:
+    results = run_ranks(2, workers.run_with_fault, "loss is NaN")
+    assert len({message for message, *_ in results}) == 1
+    assert results[0][0].startswith("FloatingPointError: The loss of rank 1 is not finite")
+    assert all(is_finite for *_, is_finite in results)
+
+
+def test_a_callback_that_stops_one_rank_stops_all() -> None:
+    # 25 steps of 4 environments, and the update of the first rollout
+    assert run_ranks(2, workers.run_until_stopped) == [(100, 2), (100, 2)]
+
+
+def test_what_cannot_be_shared_out_is_refused() -> None:
+    sentences = run_ranks(2, workers.refused, True)
+    assert "All ranks must have the same n_envs, but rank 0 has 2 and rank 1 has 3." in sentences
+    for sentence in run_ranks(2, workers.refused, False):
+        assert sentence.startswith("batch_size=15 counts for all 2 ranks together")
+
+
+def test_resumed_ranks_end_as_the_uninterrupted_ones(tmp_path: Path) -> None:
+    first, second = run_ranks(2, workers.each_algorithm, workers.run_whole, tmp_path)
+    assert len({*first, *second}) == 6  # each rank has environments and draws of its own
+    assert run_ranks(2, workers.each_algorithm, workers.resume, tmp_path) == [first, second]
+
+
+def test_rank_0_writes_and_counts_for_all(tmp_path: Path) -> None:
+    first, second = run_ranks(2, workers.run_with_outputs, tmp_path)
+    assert th.equal(first["weights"], second["weights"])
+    assert first["timesteps seen"] == second["timesteps seen"] == list(range(4, 897, 4))
+    assert (first["evaluations"], second["evaluations"]) == (224, 0)
+    assert first["episodes"] == second["episodes"]
+    assert len(first["episodes"]) == 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "best",
+        "evaluations",
+        "log",
+        "model_0.zip",
+    ]
+    assert len(list((tmp_path / "log").rglob("events.*"))) == 1
+    data: Any = load_from_zip_file(tmp_path / "model_0.zip")[0]
+    assert len(data["resume_state"].others) == 1
