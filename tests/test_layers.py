@@ -32,7 +32,7 @@ BELOW: dict[str, set[str]] = {
         "policyflow",
         "resilience",
     },
-    "imitation": {"common", "envs", "flows", "policyflow", "resilience"},
+    "imitation": {"common", "envs", "flows", "hints", "policyflow", "resilience"},
     "benchmark": {
         "callbacks",
         "common",

@@ -74,9 +74,10 @@ def clone(
         same parameters to the last bit. It is written at each validation and removed at the end.
     :return: The model.
     :raises ValueError: If demonstrations or options cannot be used.
+    :raises TypeError: If there is no such option.
     :raises FloatingPointError: If the loss is not finite.
     """
-    chosen = CloningOptions(gradient_steps, **options).checked()
+    chosen = CloningOptions.of(gradient_steps=gradient_steps, **options)
     shown = load_demonstrations(demonstrations)
     check_spaces(shown, model)
     take_up_statistics(model.get_vec_normalize_env(), shown.observations)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_policyflow.hints import install_command
 from sb3_policyflow.resilience.files import atomic_write
 
 MINARI = "minari:"
@@ -206,6 +207,6 @@ def import_minari() -> Any:
         import minari
     except ImportError as error:
         raise ImportError(
-            "Minari datasets need the library Minari: pip install 'sb3-policyflow[minari]'."
+            f"Minari datasets need the library Minari: {install_command('minari')}"
         ) from error
     return minari

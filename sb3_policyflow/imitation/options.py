@@ -1,19 +1,20 @@
 """Options of cloning."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
+from sb3_policyflow.hints import did_you_mean
 
 
 @dataclass(frozen=True)
 class CloningOptions:
     """How a policy is cloned, see :func:`~sb3_policyflow.imitation.clone`.
 
-    >>> CloningOptions(gradient_steps=0).checked()
+    >>> CloningOptions.of(gradient_steps=0)
     Traceback (most recent call last):
     ...
     ValueError: gradient_steps must be at least 1, and a whole number, got 0.
@@ -39,13 +40,19 @@ class CloningOptions:
     seed: int | None = None
     checkpoint: str | Path | None = None
 
-    def checked(self) -> "CloningOptions":
-        """These options.
+    @classmethod
+    def of(cls, **options: Any) -> "CloningOptions":
+        """The options of these names.
 
+        :raises TypeError: If there is none of a name.
         :raises ValueError: If one cannot be used.
         """
-        checks.check_options(self)
-        return self
+        known = [field.name for field in fields(cls)]
+        for name in options.keys() - set(known):
+            raise TypeError(f"clone has no argument {name!r}: {did_you_mean(name, known)}")
+        made = cls(**options)
+        checks.check_options(made)
+        return made
 
     def settings(self) -> dict[str, Any]:
         """What a run must have in common with the one that it continues."""

@@ -277,6 +277,11 @@ def test_options_that_cannot_be_used(options: dict[str, Any], what: str) -> None
     assert th.equal(weights(model), before)
 
 
+def test_an_option_that_does_not_exist() -> None:
+    with pytest.raises(TypeError, match=r"clone has no argument 'steps'.*gradient_steps"):
+        clone(pendulum(PolicyFlow), shown(), steps=10)
+
+
 def test_observations_that_are_not_finite_stop_it() -> None:
     observations, actions = shown()
     observations[5] = np.nan

@@ -272,5 +272,5 @@ def test_minari_with_dictionaries() -> None:
 
 def test_without_minari_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "minari", None)
-    with pytest.raises(ImportError, match=r"pip install 'sb3-policyflow\[minari\]'"):
+    with pytest.raises(ImportError, match=r"Minari: pip install .*minari"):
         load_demonstrations("minari:D4RL/door/human-v2")
