@@ -15,6 +15,7 @@ from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
     KLAdaptiveLearningRate,
+    adapt_learning_rate,
     parse_schedule,
     start_adaptive_learning_rate,
 )
@@ -27,11 +28,13 @@ from sb3_policyflow.common.update import (
     clip_gradients,
     take_step,
 )
-from sb3_policyflow.distributed.algorithm import DistributedOnPolicyAlgorithm
+from sb3_policyflow.device import environments
+from sb3_policyflow.distributed.ranks import Ranks, join, training_of
 from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
+from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
 
-class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
+class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
@@ -66,13 +69,27 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
-    unsaved = (*DistributedOnPolicyAlgorithm.unsaved, "_learning_rates", "known_policy_options")
+    unsaved = (
+        *ResilientOnPolicyAlgorithm.unsaved,
+        *("ranks", "_learning_rates", "known_policy_options"),
+    )
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
     trust_region: str = "ppo"
+    ranks: Ranks
+    """The processes that train this model."""
+    n_rollouts: int = 0
+    """Rollouts that the model has learned from."""
+    adaptive_learning_rate: float | None = None
+    _adaptive_start: float | None = None  # the learning rate that the adaptive one started with
+    cloned_parameters: dict[str, Any] | None = None
+    """Those of the policy after it was cloned from demonstrations."""
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
     _learning_rates: tuple[Any, Schedule]  # the rate, and the schedule that was made of it
+    # Environments may be of tensors too.
+    _wrap_env = staticmethod(environments.wrap)
+    _collect = environments.collect
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -118,6 +135,8 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
+        self.ranks = join(device)
+        self.rank = self.ranks.rank
         self.batch_size = batch_size
         self.n_epochs = n_epochs
         self.clip_range = clip_range
@@ -131,22 +150,18 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         self.allow_nan_observations = allow_nan_observations
         self.n_critic_warmup = n_critic_warmup
         self.imitation_coef = imitation_coef
-        self.cloned_parameters: dict[str, Any] | None = None
         self.policy_options = policy_options
         self.has_former_defaults = False  # an attribute of files
-        self.n_rollouts = 0
-        self.adaptive_learning_rate: float | None = None
-        self._adaptive_start: float | None = None
         super().__init__(
             policy,
             env,
-            learning_rate=cast(float, learning_rate),  # may be a string here
+            learning_rate=cast(float, learning_rate),  # or a schedule, as ent_coef
             n_steps=n_steps,
             gamma=gamma,
             gae_lambda=gae_lambda,
-            ent_coef=ent_coef,
+            ent_coef=cast(float, ent_coef),
             vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
+            max_grad_norm=cast(float, max_grad_norm),  # or None
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             rollout_buffer_class=rollout_buffer_class,
@@ -211,19 +226,6 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         self.logger.record("train/learning_rate", self.adaptive_learning_rate)
         update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
 
-    def _adapt_learning_rate(
-        self, rule: KLAdaptiveLearningRate, kls: list[th.Tensor], trains_actor: bool
-    ) -> None:
-        """Move the learning rate, if it is adaptive, by the mean of some divergences."""
-        # An actor that does not learn gives no reason to learn faster.
-        if self.adaptive_learning_rate is None or not trains_actor:
-            return
-        kl = self.ranks.mean(th.stack(kls).mean())
-        self.adaptive_learning_rate = rule.adapt(
-            self.adaptive_learning_rate, kl, self.value_of("desired_kl")
-        )
-        update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
-
     @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
@@ -248,7 +250,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
                 if not stop:
                     self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
-                    self._adapt_learning_rate(rule, kls[-1:], update.trains_actor)
+                    adapt_learning_rate(self, rule, kls[-1:], update.trains_actor)
                 if stop:
                     self.logger.info(f"Early stopping due to reaching max kl: {kls[-1].item():.2f}")
                     break
@@ -256,7 +258,7 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
             if stop:
                 break
             if rule.interval == "epoch":
-                self._adapt_learning_rate(rule, kls, update.trains_actor)
+                adapt_learning_rate(self, rule, kls, update.trains_actor)
         self._log_update(loss, th.stack(kls).mean(), metrics)
 
     def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
@@ -297,11 +299,9 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
-    def save(self, path: Any, exclude: Any = None, include: Any = None) -> None:
-        """Save the model; see :meth:`DistributedOnPolicyAlgorithm.save`."""
+    def _prepare_saving(self) -> None:
         options.note_changed_options(self)
         self.read_learning_rate()
-        super().save(path, exclude, include)
 
     def learn(
         self,
@@ -315,6 +315,6 @@ class FlowOnPolicyAlgorithm(DistributedOnPolicyAlgorithm):
         """Train for ``total_timesteps``; see SB3. Runs are named after the class by default."""
         options.take_up_changes(self)
         name = tb_log_name or type(self).__name__
-        return super().learn(
-            total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar
-        )
+        arguments = total_timesteps, callback, log_interval, name
+        training_of(self).run(super().learn, *arguments, reset_num_timesteps, progress_bar)
+        return self

@@ -5,8 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import torch as th
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import (
+    ConstantSchedule,
+    FloatSchedule,
+    LinearSchedule,
+    update_learning_rate,
+)
 
 from sb3_policyflow.common import checks
 
@@ -150,3 +156,21 @@ def start_adaptive_learning_rate(model: Any) -> None:
     elif model.adaptive_learning_rate is None or start != model._adaptive_start:
         model.adaptive_learning_rate = start
     model._adaptive_start = start
+
+
+def adapt_learning_rate(
+    model: Any, rule: KLAdaptiveLearningRate, kls: list[th.Tensor], trains_actor: bool
+) -> None:
+    """Move the learning rate of a model, if it is adaptive.
+
+    :param model: An algorithm.
+    :param rule: How it moves.
+    :param kls: Divergences whose mean, over the ranks too, it follows.
+    :param trains_actor: Whether the actor learns; else there is no reason to learn faster.
+    """
+    if model.adaptive_learning_rate is None or not trains_actor:
+        return
+    kl = model.ranks.mean(th.stack(kls).mean())
+    rate = rule.adapt(model.adaptive_learning_rate, kl, model.value_of("desired_kl"))
+    model.adaptive_learning_rate = rate
+    update_learning_rate(model.policy.optimizer, rate)

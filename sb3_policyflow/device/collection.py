@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import obs_as_tensor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow.device.normalization import TensorNormalizer
 from sb3_policyflow.envs.tensor import (
@@ -18,17 +18,6 @@ from sb3_policyflow.envs.tensor import (
 )
 from sb3_policyflow.resilience.collection import ADVICE
 from sb3_policyflow.resilience.finite import all_finite, check_finite
-
-
-def tensors_behind(env: VecEnv) -> tuple[TensorEnvAdapter, VecNormalize | None] | None:
-    """The environment of tensors, and the ``VecNormalize`` around it.
-
-    :param env: The training environment.
-    :return: None if it is of another kind, or in other wrappers, which need arrays.
-    """
-    normalize = env if isinstance(env, VecNormalize) else None
-    inner = env if normalize is None else normalize.venv
-    return (inner, normalize) if isinstance(inner, TensorEnvAdapter) else None
 
 
 class DeviceCollection:

@@ -3,8 +3,11 @@
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch as th
+
+from sb3_policyflow.resilience.training import Training, TrainingAlone
 
 
 class RankError(RuntimeError):
@@ -126,6 +129,29 @@ def _is_initialized() -> bool:
         and distributed.is_initialized()
         and distributed.get_world_size() > 1
     )
+
+
+def join(device: th.device | str) -> Ranks:
+    """The ranks that this process belongs to; of several, each has a GPU of its own.
+
+    :param device: Where the user wants the model.
+    """
+    ranks = current()
+    if ranks.size > 1:
+        use_own_gpu(device)
+    return ranks
+
+
+def training_of(model: Any) -> Training:
+    """A ``learn`` of a model, which its ranks call together if there are several.
+
+    :param model: This rank's.
+    """
+    if model.ranks.size == 1:
+        return TrainingAlone()
+    from sb3_policyflow.distributed.training import SharedTraining
+
+    return SharedTraining(model)
 
 
 def use_own_gpu(device: th.device | str) -> None:

@@ -2,7 +2,8 @@
 
 import inspect
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from sb3_policyflow.distributed import restart
 from sb3_policyflow.distributed.callback import RankCallback, as_callback, without_outputs
 from sb3_policyflow.distributed.group import ProcessGroup, process_group
 from sb3_policyflow.distributed.statistics import MergedStatistics, running_statistics
+from sb3_policyflow.resilience.training import Training, TrainingAlone
 
 OWN = {"env", "policy", "seed", "verbose", "tensorboard_log", "device", "stats_window_size"}
 """Arguments in which the ranks may differ, or that cannot be compared."""
@@ -38,7 +40,7 @@ class RolloutReport(NamedTuple):
     checksum: float
 
 
-class SharedTraining:
+class SharedTraining(Training):
     """One ``learn`` of a model that several ranks train.
 
     All ranks start with the parameters, the optimizer, the counters and the statistics of
@@ -67,9 +69,11 @@ class SharedTraining:
         """Call SB3's ``learn`` on every rank, and end all if one of them ends with an error.
 
         :param learn: SB3's, of this rank's model; the other arguments are its own.
+        :raises RankError: If another rank has stopped with an error.
+        :raises ValueError: If the ranks differ, or something cannot be shared out.
         """
         model, group = self.model, self.group
-        with group.together():
+        with self._of_model(), group.together():
             group.connect(model.device)
             self._check(total_timesteps)
             callback = as_callback(callback, progress_bar)
@@ -78,8 +82,17 @@ class SharedTraining:
             if restart.take_up(model, group, callback):
                 total_timesteps, reset_num_timesteps = max(end - model.num_timesteps, 0), False
             self._start_alike()
-            arguments = total_timesteps, callback, log_interval, tb_log_name
+            arguments = total_timesteps, self._around(callback), log_interval, tb_log_name
             learn(*arguments, reset_num_timesteps, progress_bar=False)
+
+    @contextmanager
+    def _of_model(self) -> Iterator[None]:
+        """A block in which this is the model's training."""
+        self.model._training = self
+        try:
+            yield
+        finally:
+            self.model._training = TrainingAlone()
 
     def _check(self, total_timesteps: int) -> None:
         """Refuse ranks that would not do the same, and what cannot be shared out."""
@@ -125,7 +138,7 @@ class SharedTraining:
                 vars(own).update(vars(other))
         self._statistics = MergedStatistics(statistics, self.group.sum)
 
-    def around(self, callback: BaseCallback) -> BaseCallback:
+    def _around(self, callback: BaseCallback) -> BaseCallback:
         """The user's callbacks as this rank calls them.
 
         :param callback: All of them.

@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
@@ -16,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow.resilience.collection import (
     Infos,
+    Loop,
     PendingBonus,
     StepChecks,
     rollback_statistics,
@@ -30,8 +32,10 @@ from sb3_policyflow.resilience.saving import (
     RandomStates,
     ResumeState,
     check_attributes,
+    continue_episodes,
     takes_former_path,
 )
+from sb3_policyflow.resilience.training import Training, TrainingAlone
 from sb3_policyflow.resilience.workers import watch_workers
 
 SelfResilient = TypeVar("SelfResilient", bound="ResilientOnPolicyAlgorithm")
@@ -62,6 +66,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """Values of attributes that files of earlier versions do not have."""
     unsaved: ClassVar[tuple[str, ...]] = (
         *("_callback", "_step_checks", "_saved_random_states", "_saved_observed"),
+        *("rank", "other_resume_states", "_training"),
     )
     """Attributes that no file has."""
 
@@ -74,7 +79,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     """Which of the processes that train this model this one is."""
     other_resume_states: tuple[ResumeState, ...] = ()
     """Those of the processes after the first, which saves the model."""
-
+    run_id: str = ""
+    """What tells a run that may be restarted from all others, also in its files."""
+    _training: Training = TrainingAlone()
+    """The ``learn`` that is under way; alone outside of it too."""
     _saved_observed: Observed | None = None
     """What a file says of the observations in the training that it is from."""
 
@@ -115,8 +123,9 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        """Collect one rollout; see SB3.
+        """Collect one rollout, or this process' part of it; see SB3.
 
+        :return: False if a callback of any process has stopped the training.
         :raises FloatingPointError: If environment or policy return a number that is not finite.
         :raises RuntimeError: If a worker process of the environment has died.
         :raises ValueError: If the buffer is of another size.
@@ -131,18 +140,19 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         try:
             with self._guarded():
                 self._callback = callback
-                complete = self._collect(env, callback, rollout_buffer, n_rollout_steps)
+                loop = super().collect_rollouts
+                complete = self._collect(loop, env, callback, rollout_buffer, n_rollout_steps)
         finally:
             self._callback = None
         if complete:
             check_rollout(rollout_buffer, first_timestep)
-        return complete
+        return self._training.end_rollout(complete)
 
+    @abstractmethod
     def _collect(
-        self, env: VecEnv, callback: BaseCallback, buffer: RolloutBuffer, n_steps: int
+        self, loop: Loop, env: VecEnv, callback: BaseCallback, buffer: RolloutBuffer, n_steps: int
     ) -> bool:
-        """SB3's own loop."""
-        return super().collect_rollouts(env, callback, buffer, n_steps)
+        """Collect a rollout with SB3's ``loop``, or as it must be for another environment."""
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
@@ -187,12 +197,16 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         """Save the model, and all that its training depends on, in a zip file; see SB3.
 
         The file is written completely or not at all: if the process is killed meanwhile, the old
-        file remains.
+        file remains. Where several processes train the model, rank 0 writes it, with the random
+        states of all from before the rollout that is under way, or after the last one.
 
         :param path: Where to save it, or a file opened for writing.
         :param exclude: Attributes not to save, such as "resume_state".
         :param include: Attributes to save that SB3 leaves out.
         """
+        self._prepare_saving()
+        if self.rank > 0:
+            return
         # SB3 saves the attributes that it finds, the last observations of this process too.
         state = self.own_resume_state()._replace(last_obs=None, last_episode_starts=None)
         self.resume_state = state._replace(
@@ -206,6 +220,10 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
                 super().save(path, exclude, include)
         finally:
             del self.resume_state
+
+    @abstractmethod
+    def _prepare_saving(self) -> None:
+        """Bring up to date what a file has."""
 
     def own_resume_state(self) -> ResumeState:
         """What this process needs to go on as it would have."""
@@ -268,7 +286,7 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         first: ResumeState | None = model.__dict__.pop("resume_state", None)
         state = None if first is None else first.of_rank(model.rank)
         if not force_reset:
-            model._continue_episodes(state)
+            continue_episodes(model, state)
         model._saved_observed = None if first is None else first.what_was_observed()
         if state is not None and not reseed and "seed" not in kwargs:
             model._saved_random_states = state.random_states
@@ -284,32 +302,14 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Those that ``load`` has found are forgotten.
 
-        :param seed: The seed; nothing happens without one.
+        :param seed: That of rank 0 and its first environment, from which the other processes'
+            environments go on counting; nothing happens without one.
         """
+        if seed is not None and self.rank > 0:
+            seed = (seed + self.rank * self.n_envs) % 2**32
         super().set_random_seed(seed)
         if seed is not None:
             self._saved_random_states = None
-
-    def _continue_episodes(self, state: ResumeState | None) -> None:
-        """Check an environment that is not reset against the last observations."""
-        if self.rank > 0:
-            if state is None or state.last_episode_starts is None:
-                raise ValueError(
-                    f"The file has no last observations of rank {self.rank}, which cannot "
-                    "continue in the middle of its episodes: leave out force_reset=False."
-                )
-            self._last_obs, self._last_episode_starts = state.last_obs, state.last_episode_starts
-        if self.env is None or self._last_episode_starts is None:
-            return
-        n_saved = len(self._last_episode_starts)
-        if n_saved != self.n_envs:
-            raise ValueError(
-                f"The model was saved with {n_saved} environments and cannot continue in the "
-                f"middle of their episodes with {self.n_envs}: leave out force_reset=False."
-            )
-        normalize = self.get_vec_normalize_env()
-        if normalize is not None and state is not None and state.normalized_returns is not None:
-            normalize.returns = state.normalized_returns.copy()
 
     @property
     def remaining_timesteps(self) -> int:

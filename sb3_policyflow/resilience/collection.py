@@ -4,7 +4,7 @@ SB3's own loop collects the rollout from the user's own environment: nothing sta
 checks are made after each step, when the callbacks have seen it.
 """
 
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any
@@ -16,6 +16,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_policyflow.resilience.finite import check_finite
 
 Infos = Sequence[Any]
+Loop = Callable[..., bool]
+"""SB3's ``collect_rollouts``, or another with its arguments."""
 ADVICE = "fix the environment, or find the cause with stable_baselines3.common.vec_env.VecCheckNan"
 TRUNCATED = "TimeLimit.truncated"
 

@@ -93,6 +93,33 @@ class ResumeState(NamedTuple):
         return self.observed
 
 
+def continue_episodes(model: Any, state: ResumeState | None) -> None:
+    """Check an environment that is not reset against the last observations.
+
+    :param model: A model that has just been loaded.
+    :param state: What the file has for this process.
+    :raises ValueError: If the environment cannot continue in the middle of its episodes.
+    """
+    if model.rank > 0:
+        if state is None or state.last_episode_starts is None:
+            raise ValueError(
+                f"The file has no last observations of rank {model.rank}, which cannot "
+                "continue in the middle of its episodes: leave out force_reset=False."
+            )
+        model._last_obs, model._last_episode_starts = state.last_obs, state.last_episode_starts
+    if model.env is None or model._last_episode_starts is None:
+        return
+    n_saved = len(model._last_episode_starts)
+    if n_saved != model.n_envs:
+        raise ValueError(
+            f"The model was saved with {n_saved} environments and cannot continue in the "
+            f"middle of their episodes with {model.n_envs}: leave out force_reset=False."
+        )
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None and state is not None and state.normalized_returns is not None:
+        normalize.returns = state.normalized_returns.copy()
+
+
 def check_attributes(algorithm: type[Any], given: Collection[str], saved: Collection[str]) -> None:
     """Refuse attributes for ``load`` to change that no model has.
 

@@ -1,0 +1,54 @@
+"""What a run asks of the processes that train its model: one alone, or several together."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+
+class Training(ABC):
+    """One ``learn`` of a model, as this process takes part in it."""
+
+    @abstractmethod
+    def run(
+        self,
+        learn: Callable[..., object],
+        total_timesteps: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+    ) -> None:
+        """Train the model.
+
+        :param learn: SB3's, of this process' model; the other arguments are its own.
+        """
+
+    @abstractmethod
+    def end_rollout(self, complete: bool) -> bool:
+        """Whether the training goes on after a rollout.
+
+        :param complete: Whether this process has completed its part; else a callback has stopped
+            the training.
+        """
+
+
+class TrainingAlone(Training):
+    """That of a model that only this process trains."""
+
+    def run(
+        self,
+        learn: Callable[..., object],
+        total_timesteps: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+    ) -> None:
+        arguments = total_timesteps, callback, log_interval, tb_log_name
+        learn(*arguments, reset_num_timesteps, progress_bar)
+
+    def end_rollout(self, complete: bool) -> bool:
+        return complete
