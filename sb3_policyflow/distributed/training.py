@@ -41,7 +41,10 @@ class RolloutReport(NamedTuple):
 
 
 class SharedTraining(Training):
-    """One ``learn`` of a model that several ranks train.
+    """One ``learn`` of a model that several ranks train, each in environments of its own.
+
+    What is counted or given for all environments counts for those of all ranks: ``batch_size``,
+    ``total_timesteps``, ``num_timesteps`` and what follows it. Rank 0 logs, evaluates and saves.
 
     All ranks start with the parameters, the optimizer, the counters and the statistics of
     ``VecNormalize`` of rank 0. The update itself is the algorithm's, with the help of
