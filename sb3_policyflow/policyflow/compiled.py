@@ -22,7 +22,7 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     :param update: The update, with the formulas of its class.
     :return: None if it has terms that no kernel knows.
     """
-    policy, interpolant, latent_std = update.policy, update.flow.interpolant, update.latent_std
+    policy, interpolant = update.policy, update.flow.interpolant
     has_known_formulas = (
         SURROGATES[update.trust_region] is clipped_surrogate
         and update.uniform_targets is None
@@ -44,16 +44,28 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         vf_coef=update.vf_coef,
         clip_range_vf=unbounded if update.clip_range_vf is None else update.clip_range_vf,
     )
-    latent_std = latent_std * th.ones_like(update.reference_log_std)
-    loss = KernelLoss(options, interpolant.score_coefficients)
+    return CompiledPolicyFlowLoss(update, KernelLoss(options, interpolant.score_coefficients))
 
-    def compiled_loss(
-        batch: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+
+class CompiledPolicyFlowLoss:
+    """PolicyFlow's loss of a minibatch, by a kernel.
+
+    :param update: The update that it is a part of.
+    :param kernel: The kernel, with the options of the update.
+    """
+
+    def __init__(self, update: "PolicyFlowUpdate", kernel: KernelLoss) -> None:
+        self._policy, self._kernel = update.policy, kernel
+        self._old_log_std = update.reference_log_std
+        self._latent_std = update.latent_std * th.ones_like(update.reference_log_std)
+
+    def __call__(
+        self, batch: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
     ) -> CompiledTerms | None:
         inputs = LossInputs(
             features=features,
             critic_features=critic_features,
-            log_std=policy.noise_log_std,
+            log_std=self._policy.noise_log_std,
             times=batch.drawn.times,
             points=batch.drawn.points,
             reference_velocity=batch.drawn.reference_velocity,
@@ -62,10 +74,10 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
             advantages=batch.advantages,
             old_values=batch.old_values,
             returns=batch.returns,
-            old_log_std=update.reference_log_std,
-            latent_std=latent_std,
+            old_log_std=self._old_log_std,
+            latent_std=self._latent_std,
         )
-        evaluated = loss(policy, inputs)
+        evaluated = self._kernel(self._policy, inputs)
         if evaluated is None:
             return None
         means = evaluated.terms._asdict()
@@ -73,5 +85,3 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         maxima = {"log_ratio_max": means.pop("log_ratio_max")}
         means["entropy_loss"] = -means.pop("entropy")
         return CompiledTerms(evaluated, kl, means, maxima)
-
-    return compiled_loss

@@ -157,6 +157,41 @@ def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # on
 
 
 @exact
+def _rarer_with_derivatives(  # noqa: C901  # one loop for each
+    kind: int, alpha: Any, values: Floats, derivatives: Floats
+) -> None:
+    if kind == GELU:
+        for i in range(values.size):
+            x = values[i]
+            below = _normal_cdf(x)
+            derivatives[i] = below + x * F(0.39894228) * _exp(F(-0.5) * x * x)
+            values[i] = x * below
+    elif kind == GELU_TANH:
+        for i in range(values.size):
+            x = values[i]
+            t, slope = _gelu_parts(x)
+            derivatives[i] = F(0.5) * (F(1.0) + t + x * (F(1.0) - t * t) * slope)
+            values[i] = x * (F(0.5) + F(0.5) * t)
+    elif kind == SOFTPLUS:
+        for i in range(values.size):
+            scaled = alpha * values[i]
+            derivatives[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
+            values[i] = _softplus(values[i], alpha)
+    elif kind == HARDTANH:
+        for i in range(values.size):
+            derivatives[i] = F(1.0) if abs(values[i]) < F(1.0) else F(0.0)
+            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
+            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
+    elif kind == IDENTITY:
+        for i in range(values.size):
+            derivatives[i] = F(1.0)
+    else:
+        for i in range(values.size):
+            values[i] = _sigmoid(values[i])
+            derivatives[i] = values[i] * (F(1.0) - values[i])
+
+
+@exact
 def activate_with_derivatives(  # noqa: C901  # one loop for each
     kind: int, alpha: Any, values: Floats, derivatives: Floats
 ) -> None:
@@ -192,32 +227,5 @@ def activate_with_derivatives(  # noqa: C901  # one loop for each
             y = _elu(values[i], alpha)
             derivatives[i] = F(1.0) if values[i] > F(0.0) else y + alpha
             values[i] = y
-    elif kind == GELU:
-        for i in range(values.size):
-            x = values[i]
-            below = _normal_cdf(x)
-            derivatives[i] = below + x * F(0.39894228) * _exp(F(-0.5) * x * x)
-            values[i] = x * below
-    elif kind == GELU_TANH:
-        for i in range(values.size):
-            x = values[i]
-            t, slope = _gelu_parts(x)
-            derivatives[i] = F(0.5) * (F(1.0) + t + x * (F(1.0) - t * t) * slope)
-            values[i] = x * (F(0.5) + F(0.5) * t)
-    elif kind == SOFTPLUS:
-        for i in range(values.size):
-            scaled = alpha * values[i]
-            derivatives[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
-            values[i] = _softplus(values[i], alpha)
-    elif kind == HARDTANH:
-        for i in range(values.size):
-            derivatives[i] = F(1.0) if abs(values[i]) < F(1.0) else F(0.0)
-            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
-            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
-    elif kind == IDENTITY:
-        for i in range(values.size):
-            derivatives[i] = F(1.0)
     else:
-        for i in range(values.size):
-            values[i] = _sigmoid(values[i])
-            derivatives[i] = values[i] * (F(1.0) - values[i])
+        _rarer_with_derivatives(kind, alpha, values, derivatives)
