@@ -87,8 +87,7 @@ def train(seed: int, steps: int | None, folder: Path) -> tuple[OnPolicyAlgorithm
     model = setup[0]
     assert isinstance(model, OnPolicyAlgorithm)
     model.set_logger(configure(str(folder), ["csv"]))
-    progress = GoalsCallback(EVALUATE_EVERY)
-    complete = True
+    progress, complete = GoalsCallback(EVALUATE_EVERY), True
     try:
         model.learn(experiment.n_timesteps, progress)
     except KeyboardInterrupt:

@@ -61,12 +61,6 @@ def add_variant_arguments(
         "--variants", nargs="+", choices=variants, default=list(variants), help="default: all"
     )
     # What version 0.1.0 called them.
-    parser.add_argument(
-        "--panels",
-        nargs="+",
-        choices=variants,
-        dest="variants",
-        default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,
-    )
+    hidden: Any = {"default": argparse.SUPPRESS, "help": argparse.SUPPRESS}
+    parser.add_argument("--panels", nargs="+", choices=variants, dest="variants", **hidden)
     add_running_arguments(parser, out)

@@ -159,9 +159,7 @@ class DeviceCollection:
         else:
             observations = map_observations(lambda values: values[which], self.obs)
         values = model.policy.predict_values(observations).flatten()
-        rewards = rewards.clone()
-        rewards[which] += self.buffer.gamma * values
-        return rewards
+        return rewards.index_add(0, which, self.buffer.gamma * values)
 
     def _store(self, index: int, n_steps: int, row: dict[str, th.Tensor], record: Any) -> None:
         """Keep one step; what the buffer calls its arrays is what they are called here."""

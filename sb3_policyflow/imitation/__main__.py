@@ -33,8 +33,7 @@ def main(arguments: list[str] | None = None) -> None:
         manager = _experiment(options, out, logs)
         model = manager.setup_experiment()[0]
         model.save(out)
-        normalize = model.get_vec_normalize_env()
-        if normalize is not None:
+        if (normalize := model.get_vec_normalize_env()) is not None:
             folder = out.parent / str(manager.env_name)
             folder.mkdir(exist_ok=True)
             normalize.save(folder / "vecnormalize.pkl")
