@@ -191,7 +191,8 @@ class TensorEnvAdapter(VecEnv):
 
 def as_vec_env(env: Any) -> Any:
     """A ``VecEnv`` of an environment of tensors; anything else is returned as it is."""
-    is_tensor_env = isinstance(env, TensorVecEnv) and not isinstance(env, (VecEnv, gym.Env))
+    # Other environments are not asked for attributes: a wrapper may not be able to answer yet.
+    is_tensor_env = not isinstance(env, (VecEnv, gym.Env)) and isinstance(env, TensorVecEnv)
     return TensorEnvAdapter(env) if is_tensor_env else env
 
 

@@ -1,7 +1,6 @@
 """Benchmarks run, continue, and are summed up, by the commands that users type."""
 
 import json
-import re
 import subprocess
 import sys
 import time
@@ -220,11 +219,7 @@ def test_there_is_no_curve_of_seeds_that_were_evaluated_at_different_timesteps()
 def test_table_and_plot(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["table", str(folder), "--out", str(tmp_path / "table.md")]) == 0
     assert capsys.readouterr().out == f"Wrote {tmp_path / 'table.md'}.\n"
-    steps = re.search(
-        r"\| Pendulum-v1, (\d+) steps \| fpo \| 1 \|", (tmp_path / "table.md").read_text()
-    )
-    assert steps, "in the table"
-    assert int(steps[1]) > 10, "whole rollouts were trained, and more than was asked for"
+    assert "| Pendulum-v1, 4,096 steps | fpo | 1 |" in (tmp_path / "table.md").read_text()
     assert main(["plot", str(folder), "--out", str(tmp_path)]) == 0
     written = [tmp_path / name for name in ("curves.png", "improvement.png")]
     assert capsys.readouterr().out == f"Wrote {written[0]} and {written[1]}.\n"
