@@ -11,6 +11,9 @@ N_CANDIDATES = 32
 """How many latents the deterministic action is chosen from."""
 BANDWIDTH = 0.5
 """Bandwidth of the density estimate in units of Scott's rule, which is for a single mode."""
+FIRST = 1.5
+"""How much denser others must be than the first point. It is where the latent 0 ends, and where
+there is one mode, the noise of the estimate would choose another one beside it."""
 
 
 def densest(points: th.Tensor) -> th.Tensor:
@@ -25,7 +28,7 @@ def densest(points: th.Tensor) -> th.Tensor:
     tensor([4])
 
     :param points: Shape (n, k, d).
-    :return: Indices, shape (n,). Of equal points the first.
+    :return: Indices, shape (n,); the first, unless another is :data:`FIRST` times as dense.
     """
     k, d = points.shape[1:]
     # Distances of points that lie close together, but far from zero, would be lost in rounding.
@@ -36,7 +39,7 @@ def densest(points: th.Tensor) -> th.Tensor:
     variance = squares.mean(-1) * (BANDWIDTH**2 * k ** (-2 / (d + 4)))
     scale: th.Tensor = (2 * variance).clamp_min(th.finfo(points.dtype).tiny)
     densities = (-distances / scale[:, None, None]).exp().sum(-1)
-    return densities.argmax(-1)
+    return th.cat([FIRST * densities[:, :1], densities[:, 1:]], dim=1).argmax(-1)
 
 
 def densest_endpoints(
