@@ -5,7 +5,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import torch as th
+from gymnasium import spaces
 from torch import nn
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
@@ -122,3 +125,17 @@ def within(seconds: int) -> Iterator[None]:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, former)
+
+
+class TwoWays(gym.Env[Any, Any]):
+    """Only actions other than 0 are rewarded."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), float(abs(action[0]) > 0.2), True, False, {}

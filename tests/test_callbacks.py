@@ -5,12 +5,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,7 +23,7 @@ from sb3_policyflow.callbacks import (
     warn_of_deterministic_actions,
 )
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
-from tests.helpers import SMALL, weights
+from tests.helpers import SMALL, TwoWays, weights
 
 OPTIONS: dict[str, Any] = {
     **SMALL,
@@ -147,20 +145,6 @@ def test_algorithms_without_a_flow() -> None:
 def test_numbers_that_are_too_small(options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="must be at least"):
         FlowDiagnosticsCallback(**options)
-
-
-class TwoWays(gym.Env[Any, Any]):
-    """Only actions other than 0 are rewarded."""
-
-    observation_space = spaces.Box(-1, 1, (1,))
-    action_space = spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> Any:
-        return np.zeros(1, np.float32), float(abs(action[0]) > 0.2), True, False, {}
 
 
 def test_returns_of_drawn_and_deterministic_actions() -> None:

@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -20,6 +19,7 @@ from sb3_policyflow.envs.multigoal import MultiGoalVectorEnv
 from sb3_policyflow.envs.native import make_native_vec_env
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 from sb3_policyflow.integrations.rl_zoo3.experiment import choose_config, hyperparams_folder
+from tests.helpers import TwoWays
 
 if importlib.util.find_spec("rl_zoo3") is None:
     pytest.skip("rl_zoo3 is not installed", allow_module_level=True)
@@ -251,20 +251,6 @@ def test_a_misspelt_hyperparameter_ends_the_command_with_a_sentence(tmp_path: Pa
     experiment = manager(tmp_path, "policyflow", "Pendulum-v1", hyperparams={"n_epoch": 3})
     with pytest.raises(SystemExit, match=r"no hyperparameter 'n_epoch': did you mean n_epochs"):
         experiment.setup_experiment()
-
-
-class TwoWays(gym.Env[Any, Any]):
-    """Only actions other than 0 are rewarded."""
-
-    observation_space = spaces.Box(-1, 1, (1,))
-    action_space = spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> Any:
-        return np.zeros(1, np.float32), float(abs(action[0]) > 0.2), True, False, {}
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
