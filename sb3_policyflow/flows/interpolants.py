@@ -89,8 +89,10 @@ class Interpolant(ABC):
         eta = c(t) (v + grad log p_t), where the score follows from the reference velocity v_ref:
         eta = c(t) v - (b(t) x_t - a(t) v_ref),    c score = a v_ref - b x_t
 
-        With latents of standard deviation s, a v_ref - b x_t = c s^2 score for interpolants without
-        noise of their own, since the score is -E[z | x_t] over s^2 and the coefficient of z.
+        Latents of standard deviation s are the unit of length: the residual is that of x / s and
+        v / s, and does not depend on the unit of actions. It is c (v + s^2 score) / s, since for
+        interpolants without noise of their own a v_ref - b x_t = c s^2 score: the Brownian motion
+        is s times as fast where actions have s times the range.
 
         >>> t, x, v = th.tensor([0.25]), th.tensor([[2.0]]), th.tensor([[4.0]])
         >>> Rectified().brownian_residual(v, v, x, t).item()  # 0.75 * 4 - (2 - 0.25 * 4)
@@ -106,8 +108,8 @@ class Interpolant(ABC):
         :return: eta, shape (..., dim).
         """
         score, velocity_coef, point = (c.unsqueeze(-1) for c in self.score_coefficients(times))
-        score_term = (point * points - velocity_coef * reference_velocity) / latent_std**2
-        return score * velocity - score_term
+        score_term = point * points - velocity_coef * reference_velocity
+        return (score * velocity - score_term) / latent_std
 
     def _combine(
         self,

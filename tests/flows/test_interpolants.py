@@ -126,7 +126,12 @@ def test_brownian_residual_with_narrower_and_wider_latents(name: str, latent_std
     velocity = th.randn(9, 2, dtype=th.float64)
     eta = interpolant.brownian_residual(velocity, old_velocity, x, times, latent_std)
     coefficient = interpolant.score_coefficients(times).score.unsqueeze(-1)
-    th.testing.assert_close(eta, coefficient * (velocity + score))
+    th.testing.assert_close(eta, coefficient * (velocity + latent_std**2 * score) / latent_std)
+
+    # The latents are the unit of length: it is the same with other units.
+    lengths = (velocity, old_velocity, x)
+    same = interpolant.brownian_residual(*(k / latent_std for k in lengths), times)
+    th.testing.assert_close(eta, same)
 
 
 def test_brownian_residual_vanishes_for_minus_the_score() -> None:

@@ -202,9 +202,9 @@ def test_brownian_loss_by_hand() -> None:
 
 
 def test_brownian_loss_by_hand_with_narrower_latents() -> None:
-    """With s = 1/2: eta = v / 2 - 4 (x - v_ref / 2) = (4, 1) - 4 (2, 1) = (-4, -3)."""
+    """With s = 1/2: eta = (v / 2 - (x - v_ref / 2)) / s = 2 ((4, 1) - (2, 1)) = (4, 0)."""
     _, _, update = sample_batch(tiny_model(latent_std=0.5))
-    assert update.brownian_loss(BY_HAND, th.tensor([[[8.0, 2.0]]])).item() == 25.0
+    assert update.brownian_loss(BY_HAND, th.tensor([[[8.0, 2.0]]])).item() == 16.0
 
 
 def test_latents_have_their_standard_deviation() -> None:

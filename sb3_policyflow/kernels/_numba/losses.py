@@ -223,9 +223,8 @@ def _regularize(
         reference = targets.reference_velocity[row, i]
         change += (velocity[i] - reference) * (velocity[i] - reference)
         score_term = of_point * first.points[row, i] - of_velocity * reference
-        score_term /= targets.latent_std[i] * targets.latent_std[i]
-        eta = score * velocity[i] - score_term
+        eta = (score * velocity[i] - score_term) / targets.latent_std[i]
         sums[BROWNIAN] += weight * eta * eta
         if slope != F(0.0):  # eta may be infinite
-            grads[i] += slope * score * eta
+            grads[i] += slope * score * eta / targets.latent_std[i]
     sums[CHANGE] += math.sqrt(change)
