@@ -1,140 +1,124 @@
-"""Every Python block of README and documentation runs, and every command is one that there is.
+"""README and documentation as one who types along: Python blocks and commands run, page by page.
 
-Blocks run with small budgets: ``learn`` collects one rollout, and an evaluation is of one episode.
-Commands are parsed by the programs that they start, and not carried out: the tests of the commands
-do that. A comment ``<!-- not run: WHY -->`` before a block says why it cannot run.
+Blocks of a page run in their order, in one empty folder, so that a command finds what the one
+before it wrote. Budgets are small: ``learn`` collects one rollout, cloning takes ten steps, and
+commands get the arguments of ``doc_blocks.BUDGETS``. All run in this process, trainings of the
+benchmark too. Not run, but parsed by the programs that they start, are commands
+
+- that differ from one before them on the page in the values of their options alone;
+- of the benchmark that another page has as well, with any options;
+- of a block with a comment ``<!-- not run: WHY -->`` before it;
+- of programs that are not this package's (``doc_blocks.NEVER_RUN``).
 """
 
-import importlib
+import argparse
+import importlib.util
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from stable_baselines3.common import evaluation
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+import sb3_policyflow.benchmark.run
 from sb3_policyflow.benchmark.__main__ import COMMANDS
-
-ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
-BLOCK = re.compile(
-    r"(?ms)(?:<!-- not run: (?P<reason>[^\n]+?) -->\s*)?^```(?P<kind>\w*)\n(?P<text>.*?)^```$"
+from sb3_policyflow.imitation.options import CloningOptions
+from tests.doc_blocks import (
+    NEVER_RUN,
+    PAGES,
+    ROOT,
+    Block,
+    blocks,
+    inline,
+    kind,
+    program,
+    run,
+    with_small_budget,
 )
-SHELLS = ("sh", "bash", "")
-ELSEWHERE = {
-    "./isaaclab.sh": "IsaacLab's own",
-    "createdb": "PostgreSQL's",
-    "export": "the shell's",
-    "make": "tests/test_doc_blocks.py looks for its targets",
-    "optuna": "Optuna's",
-    "optuna-dashboard": "Optuna's",
-    "pip": "the installer's",
-    "tensorboard": "TensorBoard's",
-    "torchrun": "PyTorch's",
-    "trackio": "trackio's",
-}
-"""Programs that are not this package's, and whose."""
 
-
-class Block(NamedTuple):
-    page: str
-    line: int
-    kind: str
-    text: str
-    reason: str | None
-
-    def __str__(self) -> str:
-        return f"{self.page}:{self.line}"
-
-
-def blocks(*kinds: str) -> Iterator[Block]:
-    for page in PAGES:
-        text = (ROOT / page).read_text(encoding="utf-8")
-        for match in BLOCK.finditer(text):
-            if match["kind"] in kinds:
-                line = text[: match.start()].count("\n") + 1
-                yield Block(page, line, match["kind"], match["text"], match["reason"])
-
-
-def commands(block: Block) -> list[list[str]]:
-    """The words of each command, in a block of them; none in one of something else."""
-    joined = block.text.replace("\\\n", " ")
-    lines = [shlex.split(line, comments=True) for line in joined.splitlines()]
-    return [words for words in lines if words]
-
-
-PYTHON = list(blocks("python"))
-SHELL = [
-    block
-    for block in blocks(*SHELLS)
-    if block.kind or block.text.startswith(("python ", "rl_zoo3 "))
+ALL = [
+    block for page in PAGES for block in blocks(page) if block.kind == "python" or block.commands()
 ]
+BEFORE = {"docs/zoo.md": ["python -m rl_zoo3.train --algo policyflow --env MultiGoal-v0"]}
+"""What a page takes for granted: plots of several runs need a second one."""
 
 
 @pytest.fixture
 def small_budgets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    learn, evaluate = OnPolicyAlgorithm.learn, evaluation.evaluate_policy
+    learn, evaluate, options = (
+        OnPolicyAlgorithm.learn,
+        evaluation.evaluate_policy,
+        CloningOptions.of,
+    )
 
     def learn_little(self: Any, total_timesteps: int, *args: Any, **kwargs: Any) -> Any:
         assert total_timesteps >= 0
         self.n_epochs = 1
-        return learn(self, 1, *args, **kwargs)
+        return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args, **kwargs)
 
     def evaluate_little(*args: Any, **kwargs: Any) -> Any:
         return evaluate(*args, **{**kwargs, "n_eval_episodes": 1})
 
+    def clone_little(**kwargs: Any) -> CloningOptions:
+        return options(**{**kwargs, "gradient_steps": 10})
+
+    def in_this_process(command: list[str], **_: Any) -> Any:
+        run(["python", *command[1:]])
+        return subprocess.CompletedProcess(command, 0)
+
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", learn_little)
     monkeypatch.setattr(evaluation, "evaluate_policy", evaluate_little)
+    monkeypatch.setattr(CloningOptions, "of", clone_little)
+    processes = SimpleNamespace(run=in_this_process, STDOUT=subprocess.STDOUT)
+    monkeypatch.setattr(sb3_policyflow.benchmark.run, "subprocess", processes)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.chdir(tmp_path)
 
 
-def pages_of_blocks() -> dict[str, list[Block]]:
-    pages: dict[str, list[Block]] = {}
-    for block in PYTHON:
-        pages.setdefault(block.page, []).append(block)
-    return pages
+def commands_to_run(page: str) -> dict[str, list[list[str]]]:
+    """The commands of a page that are run, by the block in which they are."""
+    seen: set[tuple[str, ...]] = set()
+    elsewhere = {
+        program(words)
+        for other in PAGES[: PAGES.index(page)]
+        for block in blocks(other)
+        for words in block.commands()
+        if program(words).startswith("sb3_policyflow.benchmark")
+    }
+    chosen: dict[str, list[list[str]]] = {}
+    for block in blocks(page):
+        for words in block.commands() if block.reason is None else []:
+            is_ours = words[0] not in NEVER_RUN and program(words) not in elsewhere
+            if is_ours and kind(words) not in seen:
+                seen.add(kind(words))
+                chosen.setdefault(str(block), []).append(words)
+    return chosen
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", pages_of_blocks())
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules after import")
+@pytest.mark.parametrize("page", dict.fromkeys(block.page for block in ALL))
 @pytest.mark.usefixtures("small_budgets")
-def test_python_blocks_run(page: str) -> None:
-    for block in pages_of_blocks()[page]:
-        if block.reason is None:
-            # Each by itself: a reader copies one. The files that one writes, the next may read.
-            code = compile(block.text, str(block), "exec")
-            exec(code, {"__name__": "__main__"})
+def test_pages_run(page: str) -> None:
+    pytest.importorskip("rl_zoo3")
+    commands = commands_to_run(page)
+    for line in BEFORE.get(page, []):
+        run(with_small_budget(shlex.split(line)))
+    for block in blocks(page):
+        if block.kind == "python" and block.reason is None:
+            # Each by itself: a reader copies one.
+            exec(compile(block.text, str(block), "exec"), {"__name__": "__main__"})
+        for words in commands.get(str(block), []):
+            run(with_small_budget(words))
 
 
-def parse(words: list[str]) -> None:
-    """Have a command parsed by its program; SystemExit if it does not take it."""
-    module, arguments = words[2], words[3:]
-    if module == "sb3_policyflow.benchmark":
-        folder, _ = COMMANDS[arguments[0]]
-        import argparse
-
-        parser = argparse.ArgumentParser()
-        importlib.import_module(f"sb3_policyflow.benchmark.{folder}").add_arguments(parser)
-        parser.parse_args(
-            [word.replace("N", "0") if word == "N" else word for word in arguments[1:]]
-        )
-    elif module == "sb3_policyflow.export":
-        from sb3_policyflow.export.__main__ import main
-
-        with pytest.raises(SystemExit, match="There is no file"):
-            main(arguments)
-    else:
-        ours = "sb3_policyflow.imitation", "sb3_policyflow.integrations.isaaclab"
-        assert module.startswith(("rl_zoo3.", *ours)), words
-        options = options_of(module)
-        for word in arguments:  # argparse takes an option by its beginning
-            if re.match(r"--?[a-z]", word):
-                assert any(option.startswith(word) for option in options), words
+OPTIONS: dict[str, set[str]] = {}
 
 
 def options_of(module: str) -> set[str]:
@@ -146,28 +130,50 @@ def options_of(module: str) -> set[str]:
     return OPTIONS[module]
 
 
-OPTIONS: dict[str, set[str]] = {}
+def parse(words: list[str]) -> None:
+    """Have a command parsed by its program; SystemExit if it does not take it."""
+    module, arguments = words[2], words[3:]
+    if module == "sb3_policyflow.benchmark":
+        folder, _ = COMMANDS[arguments[0]]
+        parser = argparse.ArgumentParser()
+        importlib.import_module(f"sb3_policyflow.benchmark.{folder}").add_arguments(parser)
+        parser.parse_args(["0" if word == "N" else word for word in arguments[1:]])
+    else:
+        assert module.startswith(("rl_zoo3.", "sb3_policyflow.")), words
+        options = options_of(module)
+        for word in arguments:  # argparse takes an option by its beginning
+            if re.match(r"--?[a-z]", word):
+                assert any(option.startswith(word) for option in options), words
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", SHELL, ids=str)
+@pytest.mark.parametrize("block", [block for block in ALL if block.commands()], ids=str)
 def test_commands_are_ones_that_there_are(block: Block) -> None:
     pytest.importorskip("rl_zoo3")
     makefile = (ROOT / "Makefile").read_text()
-    for words in commands(block):
+    for words in block.commands():
         if words[0] == "make":
             assert all(re.search(rf"(?m)^{target}:", makefile) for target in words[1:])
         elif words[:2] == ["python", "-m"]:
             parse(words)
         elif words[0] == "python" and words[1] != "-c":
             assert (ROOT / words[1]).is_file()
-        elif words[0] == "rl_zoo3":
-            assert words[1] in ("plot_train", "all_plots", "plot_from_file")
         else:
-            assert words[0] == "python" or words[0] in ELSEWHERE, words
+            assert words[0] in ("python", "rl_zoo3", *NEVER_RUN), words
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_of_sentences_are_ones_that_there_are(page: str) -> None:
+    for words in inline(page):
+        if words[1] != "-m":
+            assert (ROOT / words[1]).is_file(), words
+        elif words[2] == "sb3_policyflow.benchmark":
+            assert words[3:] == [] or words[3] in COMMANDS, words
+        else:
+            assert importlib.util.find_spec(words[2]) is not None, words
 
 
 def test_few_blocks_are_not_run_and_each_says_why() -> None:
-    left_out = [block for block in PYTHON if block.reason is not None]
-    assert len(left_out) <= len(PYTHON) // 3
+    left_out = [block for block in ALL if block.reason is not None]
+    assert len(left_out) <= len(ALL) // 3
     assert all(len(block.reason or "") > 10 for block in left_out)
