@@ -13,8 +13,10 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 import sb3_policyflow.envs
+from sb3_policyflow import PolicyFlow
 from sb3_policyflow.envs import ensure_registered
 from sb3_policyflow.hints import install_command
+from tests.helpers import SMALL
 
 TASK = "Playground/CheetahRun-v0"
 
@@ -83,6 +85,22 @@ def test_a_missing_extra_is_named_in_one_sentence(
     sentence = re.escape(f"{env_id} needs {module}: run `{install_command(extra)}`")
     with pytest.raises(DependencyNotInstalled, match=f"^{sentence}$"):
         make(env_id)
+
+
+@pytest.mark.filterwarnings("ignore:.*Overriding environment")
+def test_algorithms_find_the_environments_of_gymnasium_robotics(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    env_id = "PointMaze_UMaze-v3"
+    monkeypatch.delitem(gym.registry, env_id, raising=False)
+    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
+    with pytest.raises(DependencyNotInstalled, match=f"{env_id} needs gymnasium_robotics: run"):
+        PolicyFlow("MultiInputPolicy", env_id)
+    monkeypatch.delitem(sys.modules, "gymnasium_robotics")  # as where nothing has imported it
+    pytest.importorskip("gymnasium_robotics")
+    monkeypatch.delitem(gym.registry, env_id, raising=False)
+    monkeypatch.delitem(sys.modules, "gymnasium_robotics")
+    assert PolicyFlow("MultiInputPolicy", env_id, **SMALL).n_envs == 1
 
 
 @pytest.fixture

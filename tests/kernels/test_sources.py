@@ -173,6 +173,21 @@ def test_kernels_are_kept_until_a_source_changes(
     assert [n_loaded(load()), n_loaded(load())] == [0, 1]
 
 
+def test_compiling_is_announced_once_and_only_where_nothing_is_kept(
+    load: Callable[[], Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    said = []
+    for _ in range(2):  # as in two processes, of which the second finds what the first compiled
+        ours._announce.cache_clear()
+        load()
+        said.append([message for message in caplog.messages if "Compiling" in message])
+        caplog.clear()
+    assert said == [
+        ["Compiling the CPU kernels, once after an installation: about 20 seconds."],
+        [],
+    ]
+
+
 @pytest.mark.parametrize("pattern", ["*.nbi", "*.nbc"])
 @pytest.mark.parametrize("rest", [b"", b"broken", b"\x80\x05"])
 def test_files_that_cannot_be_read_are_made_again(

@@ -220,6 +220,12 @@ def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) 
     assert os.listdir(tmp_path) == ["model.zip"]
 
 
+def test_a_place_that_cannot_be_written_is_called_what_the_user_calls_it(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"Not a directory: '.*/file/model\.zip'$"):
+        small_model().save(tmp_path / "file" / "model")
+
+
 def test_names_are_those_of_sb3(tmp_path: Path) -> None:
     model = small_model()
     (tmp_path / "folder.zip").mkdir()
