@@ -12,7 +12,7 @@ PLAYGROUND_TESTS := tests/envs/test_playground.py tests/envs/test_playground_tas
 	tests/integrations/rl_zoo3/test_playground_commands.py \
 	tests/integrations/rl_zoo3/test_experiment.py
 
-.PHONY: demo test test-fast test-playground lint types docs clean
+.PHONY: demo test test-fast test-playground lint types docs check-pages clean
 
 demo: $(VENV)/demo-installed
 	$(BIN)/python -m sb3_policyflow.benchmark demo
@@ -38,12 +38,17 @@ types: $(VENV)/tests-installed
 docs: $(VENV)/docs-installed
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
+# As a reader sees the pages. Needs Chromium, from the system's packages.
+check-pages: docs $(VENV)/browser-installed
+	$(BIN)/python tests/scripts/check_pages.py docs/_build/html
+
 clean:
 	rm -rf $(VENV) docs/_build build dist
 
 $(VENV)/demo-installed: EXTRAS := plots,zoo
 $(VENV)/tests-installed: EXTRAS := tests
 $(VENV)/docs-installed: EXTRAS := docs
+$(VENV)/browser-installed: EXTRAS := browser
 $(VENV)/playground-installed: EXTRAS := tests,playground
 
 $(VENV)/%-installed: pyproject.toml .ci/constraints.txt

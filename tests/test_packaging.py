@@ -77,5 +77,6 @@ def test_extras_bring_what_their_commands_import() -> None:
     }
     assert {"tensorboard", "rl-zoo3"} <= names["zoo"]
     assert names["onnx"] == {"onnx", "onnxscript"}
+    assert names["browser"] == {"playwright"}
     assert names["plots"] == {"matplotlib", "rliable", "pandas"}
     assert list(PROJECT["project"]["urls"]) == ["Repository"]

@@ -3,8 +3,9 @@
     python tests/scripts/check_pages.py docs/_build/html [PAGE ...]
 
 Each page is opened at 1440 and 390 pixels, light and dark, without a network. It fails on errors of
-the page, formulas that are not rendered, and pages wider than the window. Needs ``playwright`` from
-PyPI, and a Chromium, whose path the variable CHROMIUM may name.
+the page, formulas that are not rendered, pages wider than the window, and, on the large screen, on
+tables and code that have to be scrolled. Needs the extra ``browser``, and Chromium, whose path the
+variable CHROMIUM may name.
 """
 
 import argparse
@@ -32,6 +33,11 @@ CLIPPED = """() => [...document.querySelectorAll('article table, article pre, ar
     .filter(each => { for (let box = each; box; box = box.parentElement) {
         if (['auto', 'scroll'].includes(getComputedStyle(box).overflowX)) return false; }
         return true; }).map(each => each.textContent.trim().slice(0, 60))"""
+
+SCROLLED = """() => [...document.querySelectorAll('article *')]
+    .filter(each => ['auto', 'scroll'].includes(getComputedStyle(each).overflowX))
+    .filter(each => each.scrollWidth > each.clientWidth + 1)
+    .map(each => each.textContent.trim().slice(0, 60))"""
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
@@ -73,6 +79,8 @@ def faults_of(page: Any, url: str) -> list[str]:
     faults += [f"formula not rendered: {text}" for text in page.evaluate(UNRENDERED)]
     faults += [f"formula with an error: {text}" for text in page.evaluate(BAD_FORMULAS)]
     faults += [f"cannot be scrolled to: {text}" for text in page.evaluate(CLIPPED)]
+    if page.viewport_size["width"] == max(WIDTHS):
+        faults += [f"has to be scrolled: {text}" for text in page.evaluate(SCROLLED)]
     overflow = page.evaluate(OVERFLOW)
     if overflow > 1:
         faults.append(f"wider than the window by {overflow} px")
