@@ -15,7 +15,7 @@ from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
-from sb3_policyflow.benchmark.report.table import seeds_caption
+from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
 from sb3_policyflow.benchmark.results import Result, Run, distinct, load_results
 from sb3_policyflow.benchmark.run import add_running_arguments, run_and_report
 from sb3_policyflow.imitation.demonstrators import demonstrate, make_env
@@ -123,7 +123,7 @@ QUANTITIES = {"return": ".2f", "mean_return": ".2f", "n_goals": ".2g", "entropy"
 
 def _row(name: str, results: Sequence[Result]) -> list[str]:
     style, algo = name.split("-")
-    row = [style, algo, str(len(results)), f"{results[0].run.steps:,}"]
+    row = [style, algo, str(len(results)), steps_trained(results)]
     stages = [
         [
             {"return": evaluation["mean_return"], **goals}

@@ -14,7 +14,7 @@ from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.measure.goals import Trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
-from sb3_policyflow.benchmark.report.table import seeds_caption
+from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
 from sb3_policyflow.benchmark.results import Result, Run, distinct, load_results
 from sb3_policyflow.benchmark.run import run_and_report
 from sb3_policyflow.benchmark.variants import Variant, add_variant_arguments, variant_runs
@@ -86,7 +86,8 @@ def goals_table(results: Sequence[Result]) -> str:
         _row(name, [result for result in results if result.run.name == name])
         for name in distinct(results, "name")
     ]
-    return f"{markdown_table(HEADER, rows)}\n\n{seeds_caption(results)}\n"
+    caption = f"{seeds_caption(results)} Environment steps: {steps_trained(results)}."
+    return f"{markdown_table(HEADER, rows)}\n\n{caption}\n"
 
 
 def _row(name: str, results: Sequence[Result]) -> list[str]:

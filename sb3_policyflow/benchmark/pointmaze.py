@@ -13,7 +13,7 @@ from sb3_policyflow.benchmark.figures.visits import density_figure
 from sb3_policyflow.benchmark.measure.visits import VisitMap
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
-from sb3_policyflow.benchmark.report.table import seeds_caption
+from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
 from sb3_policyflow.benchmark.results import Result, load_results
 from sb3_policyflow.benchmark.run import run_and_report
 from sb3_policyflow.benchmark.variants import Variant, add_variant_arguments, variant_runs
@@ -48,7 +48,8 @@ def visits_table(results: Sequence[Result], maps: dict[str, list[VisitMap]]) -> 
                 over_seeds([final["mean_return"] for final in finals]).format(".1f"),
             ]
         )
-    return f"{markdown_table(HEADER, rows)}\n\n{seeds_caption(results)}\n"
+    caption = f"{seeds_caption(results)} Environment steps: {steps_trained(results)}."
+    return f"{markdown_table(HEADER, rows)}\n\n{caption}\n"
 
 
 def draw(folder: Path, results: Sequence[Result]) -> None:

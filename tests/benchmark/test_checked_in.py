@@ -10,6 +10,8 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("gymnasium_robotics")
 
 from sb3_policyflow.benchmark import multigoal, playground, pointmaze
+from sb3_policyflow.benchmark.report.table import report, results_table
+from sb3_policyflow.benchmark.results import load_results
 from sb3_policyflow.benchmark.variants import Variants, variant_runs
 from sb3_policyflow.envs.point_maze import ENV_ID
 
@@ -22,6 +24,14 @@ def n_done(folder: str, variants: Variants, n_evaluations: int, steps: int, **fi
     arguments.evaluations, arguments.episodes = n_evaluations, 2 * n_evaluations
     runs = variant_runs(variants, arguments, **fields)
     return sum(run.is_done(RESULTS / folder) for run in runs)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "halfcheetah"])
+def test_tables_are_those_of_the_results(name: str) -> None:
+    text = report(load_results(RESULTS / name))
+    assert text == (RESULTS / name / "table.md").read_text(encoding="utf-8")
+    page = (RESULTS.parent / "results.md").read_text(encoding="utf-8")
+    assert results_table(load_results(RESULTS / name)) in page
 
 
 def test_multigoal() -> None:

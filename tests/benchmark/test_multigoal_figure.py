@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                     variant.algo,
                     multigoal.ENV,
                     seed,
-                    64,
+                    60,
                     {**variant.hyperparams, **FAST},
                     n_evaluations=1,
                     n_episodes=2,
@@ -61,6 +61,7 @@ def test_figure_and_table(folder: Path) -> None:
     table = (folder / "multigoal.md").read_text()
     assert "| (c) FPO | 2 |" in table
     assert "| (d) PolicyFlow, uniform noise | 2 |" in table
+    assert "Environment steps: 64." in table  # one rollout, where 60 were asked for
 
 
 def test_kept_trajectories(folder: Path) -> None:

@@ -53,15 +53,13 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _row(results: Sequence[Result], name: str, env: str) -> list[str]:
-    # What was trained: whole rollouts, of which the last may go beyond what was asked for.
-    steps = {result.summary["timesteps"] for result in results}
     evaluations = [result.summary["network_evaluations"] for result in results]
     acting, updating = (np.mean([e[key] for e in evaluations]) for key in ("acting", "updating"))
     minutes = np.mean([result.summary["seconds"]["training"] for result in results]) / 60
     returns = [[result.final_return(mode) for result in results] for mode in MODES]
     found = [[value for value in values if value is not None] for values in returns]
     return [
-        f"{env}, {' / '.join(f'{step:,}' for step in sorted(steps))} steps",
+        f"{env}, {steps_trained(results)} steps",
         name,
         str(len(results)),
         *(over_seeds(values).format() if values else "-" for values in found),
@@ -69,6 +67,12 @@ def _row(results: Sequence[Result], name: str, env: str) -> list[str]:
         f"{acting / 1e6:,.1f} M / {updating / 1e6:,.1f} M",
         f"{minutes:.1f}",
     ]
+
+
+def steps_trained(results: Sequence[Result]) -> str:
+    """How long trainings were: whole rollouts, which may go beyond what was asked for."""
+    steps = {result.summary["timesteps"] for result in results}
+    return " / ".join(f"{step:,}" for step in sorted(steps))
 
 
 def seeds_caption(results: Sequence[Result]) -> str:
