@@ -1,5 +1,6 @@
 """What the tests share: small runs, and a model's numbers to compare."""
 
+import hashlib
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from torch import nn
 
 from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.resilience.saving import RandomStates
 
 SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1, "seed": 0}
 """Options of the smallest run that has two minibatches."""
@@ -109,6 +111,28 @@ def n_updates(model: Any) -> int:
 def last_observations(model: Any) -> Any:
     """The observations that the next rollout starts with; None if it resets the environment."""
     return model._last_obs
+
+
+def digest(model: Any) -> str:
+    """A hash of all that the rest of a training depends on, and of what is drawn next.
+
+    :param model: A model in a ``VecNormalize``.
+    """
+    statistics = model.get_vec_normalize_env()
+    optimizer = model.policy.optimizer.state_dict()["state"]
+    states = RandomStates.now(model.device)
+    arrays = [
+        *model.policy.state_dict().values(),
+        *(value for state in optimizer.values() for value in state.values()),
+        *(statistics.obs_rms.mean, statistics.obs_rms.var, statistics.ret_rms.var),
+        *(statistics.returns, last_observations(model)),
+        *(states.torch, states.numpy["state"]["key"]),
+    ]
+    numbers = model._n_updates, model.num_timesteps, model.adaptive_learning_rate, states.python
+    sha = hashlib.sha256(repr(numbers).encode())
+    for array in arrays:
+        sha.update(np.asarray(array).tobytes())
+    return sha.hexdigest()
 
 
 @contextmanager

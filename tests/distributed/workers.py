@@ -1,6 +1,5 @@
 """What the ranks do in the tests: each function is called by every rank."""
 
-import hashlib
 import os
 import signal
 import time
@@ -19,7 +18,7 @@ from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.distributed.ranks import current
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
-from tests.helpers import weights
+from tests.helpers import digest, weights
 
 SIZES: dict[str, Any] = {"n_steps": 16, "batch_size": 16, "n_epochs": 2, "seed": 0}
 NETWORKS: dict[str, Any] = {"net_arch": [8], "embedding_dim": 8}
@@ -172,15 +171,6 @@ class StatesCallback(BaseCallback):
         inner: Any = self.training_env.unwrapped
         name = f"{self.model.num_timesteps}.{current().rank}"
         th.save(inner.get_state(), self.folder / name)
-
-
-def digest(model: Any) -> str:
-    """A hash of what the training has come to, and of what is drawn next."""
-    normalize = model.get_vec_normalize_env()
-    numbers = [weights(model).numpy(), normalize.obs_rms.mean, normalize.ret_rms.var]
-    numbers += [normalize.returns, model._last_obs, th.rand(4).numpy(), np.random.rand(4)]
-    content = b"".join(np.asarray(each).tobytes() for each in numbers)
-    return hashlib.sha256(content).hexdigest()
 
 
 ALGORITHMS = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}

@@ -6,13 +6,11 @@ python tests/scripts/resume.py resume FOLDER ALGORITHM    goes on from that chec
 Prints one line: a digest of everything that the rest of the training depends on.
 """
 
-import hashlib
 import pickle
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
@@ -20,8 +18,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
-from sb3_policyflow.resilience.saving import RandomStates
-from tests.helpers import last_observations, n_updates
+from tests.helpers import digest
 
 ALGORITHMS: dict[str, type[Any]] = {"PolicyFlow": PolicyFlow, "FPO": FPO, "DPPO": DPPO}
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -33,24 +30,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
 N_ENVS, N_STEPS, ITERATIONS = 8, 32, 4
 TOTAL = N_ENVS * N_STEPS * ITERATIONS
 HALF = TOTAL // 2
-
-
-def digest(model: Any) -> str:
-    """A hash of parameters, optimizer, learning rate, statistics and random states."""
-    normalize = model.get_vec_normalize_env()
-    optimizer = model.policy.optimizer.state_dict()
-    parts = [
-        *model.policy.state_dict().values(),
-        *(value for state in optimizer["state"].values() for value in state.values()),
-        *(normalize.obs_rms.mean, normalize.obs_rms.var, normalize.ret_rms.var, normalize.returns),
-        *(last_observations(model), n_updates(model)),
-        *(model.num_timesteps, model.adaptive_learning_rate),
-        RandomStates.now(model.device).torch,
-    ]
-    sha = hashlib.sha256()
-    for part in parts:
-        sha.update(np.asarray(part).tobytes())
-    return sha.hexdigest()
 
 
 class KeepEnvState(BaseCallback):
