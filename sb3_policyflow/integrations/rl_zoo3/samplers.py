@@ -98,14 +98,13 @@ def sampler(
 def sample_policyflow_params(trial: Trial) -> dict[str, Any]:
     """Draw hyperparameters of PolicyFlow.
 
-    Latents are as wide as a share of the actions' range. The Brownian regularizer of wider latents
-    is smaller by the square, which its weight makes up for.
+    Latents are as wide as a share of the actions' range. They are the unit of the Brownian
+    regularizer, whose weight therefore means the same for all tasks.
     """
     scale = TASK.get().action_scale
-    lowest, highest = 1e-4 * scale**2, 0.5 * scale**2
     params = {
         "ent_coef": trial.suggest_float("ent_coef", 1e-6, 0.03, log=True),
-        "brownian_coef": trial.suggest_float("brownian_coef", lowest, highest, log=True),
+        "brownian_coef": trial.suggest_float("brownian_coef", 1e-4, 0.5, log=True),
         "interpolant": trial.suggest_categorical(
             "interpolant", ["rectified", "stochastic", "trigflow"]
         ),

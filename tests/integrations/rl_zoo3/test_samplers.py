@@ -129,7 +129,7 @@ def test_the_spread_is_drawn_on_the_scale_of_the_actions() -> None:
     stds = [std for std in stds if std is not None]
     assert 0.5 <= min(stds) < 1
     assert 2.5 < max(stds) <= 5
-    coefs = np.array([params["brownian_coef"] for params in drawn], dtype=float) / 25
+    coefs = np.array([params["brownian_coef"] for params in drawn], dtype=float)
     assert 1e-4 <= coefs.min() < 1e-3
     assert 0.1 < coefs.max() <= 0.5
     assert Task.of(10, spaces.Box(-np.inf, np.inf, (3,))).action_scale == 1.0
