@@ -97,6 +97,7 @@ def test_actions_that_are_whole_numbers(dtype: type[np.generic]) -> None:
         ({"learning_rate": -1e-3}, r"learning_rate must not be negative nor infinite, got -0\.001"),
         ({"learning_rate": None}, r"learning_rate must be a number, a string .* got None"),
         ({"clip_range": -0.2}, r"clip_range must not be negative"),
+        ({"clip_range": 0.0}, r"clip_range must be positive, got 0\.0"),
         ({"gamma": 1.5}, r"gamma must be a number from 0.0 to 1.0, got 1.5"),
         ({"gae_lambda": float("nan")}, r"gae_lambda must be a number from 0.0 to 1.0, got nan"),
         ({"batch_size": 1}, r"batch_size must be at least 2"),

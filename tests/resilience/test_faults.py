@@ -18,7 +18,7 @@ from sb3_policyflow import PolicyFlow
 from sb3_policyflow.algorithms import ALGORITHMS
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 from sb3_policyflow.fpo import FPO
-from tests.helpers import SMALL, train, weights, within
+from tests.helpers import SMALL, perturb, train, weights, within
 
 FAULT_STEP = 5
 EIGHT_STEPS: dict[str, Any] = {**SMALL, "n_steps": 8, "batch_size": 16}
@@ -218,6 +218,9 @@ def test_predicted_actions(name: str, deterministic: bool) -> None:
     model.predict(obs[:1], deterministic=deterministic)
     with pytest.raises(ValueError, match="observation 1" if name != "PPO" else "invalid values"):
         model.predict(obs, deterministic=deterministic)
+    perturb(model.policy, float("nan"))  # nor has a policy whose parameters are not
+    with pytest.raises(ValueError, match="observation 0" if name != "PPO" else "invalid values"):
+        model.predict(obs[:1], deterministic=deterministic)
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")
