@@ -17,7 +17,7 @@ BELOW: dict[str, set[str]] = {
     "kernels": {"flows"},
     "device": {"envs", "resilience"},
     "distributed": {"resilience"},
-    "common": {"device", "distributed", "envs", "flows", "hints", "kernels", "resilience"},
+    "common": {"device", "distributed", "flows", "hints", "kernels", "resilience"},
     **{name: {"common", "flows", "kernels"} for name in ALGORITHMS},
     "algorithms": {"common", *ALGORITHMS},
     "callbacks": {"common", "flows", "policyflow", "resilience"},

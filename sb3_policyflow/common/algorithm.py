@@ -30,7 +30,6 @@ from sb3_policyflow.common.update import (
 )
 from sb3_policyflow.device import environments
 from sb3_policyflow.distributed.ranks import Ranks, join, training_of
-from sb3_policyflow.envs.registration import ensure_registered
 from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 
@@ -153,11 +152,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.imitation_coef = imitation_coef
         self.policy_options = policy_options
         self.has_former_defaults = False  # an attribute of files
-        if isinstance(env, str):
-            ensure_registered(env)
         super().__init__(
             policy,
-            env,
+            environments.registered(env),
             learning_rate=cast(float, learning_rate),  # or a schedule, as ent_coef
             n_steps=n_steps,
             gamma=gamma,

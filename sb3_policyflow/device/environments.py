@@ -1,4 +1,7 @@
-"""Environments of tensors in an algorithm of SB3: how they are wrapped and collected from."""
+"""Environments in an algorithm of SB3: how they are found, wrapped and collected from.
+
+Those of tensors too.
+"""
 
 from typing import Any
 
@@ -8,8 +11,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_policyflow.device.collection import DeviceCollection
+from sb3_policyflow.envs.registration import ensure_registered
 from sb3_policyflow.envs.tensor import TensorEnvAdapter, as_vec_env
 from sb3_policyflow.resilience.collection import Loop
+
+
+def registered(env: Any) -> Any:
+    """An environment as the user gave it; an id that this package knows of is registered first.
+
+    :param env: The environment, or its id.
+    """
+    if isinstance(env, str):
+        ensure_registered(env)
+    return env
 
 
 def wrap(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
