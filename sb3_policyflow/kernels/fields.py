@@ -64,7 +64,7 @@ class FieldParts:
         self.places = [tensor.data_ptr() for tensor in self.held]
         self._require_fit()
         self.layout = FieldLayout(
-            self.dim, *time.activation, len(frequencies), self.places[0], *self.places[1:9]
+            self.dim, *time.activation_layout, len(frequencies), self.places[0], *self.places[1:9]
         )
 
     def _require_fit(self) -> None:

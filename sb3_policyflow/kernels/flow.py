@@ -133,8 +133,8 @@ def _make_plan(
         widths=network.widths,
         output=weight.numpy(),
         bias=bias.numpy(),
-        kind=network.activation.kind,
-        alpha=np.float32(network.activation.alpha),
+        activation=network.layout.activation,
+        alpha=np.float32(network.layout.alpha),
     )
     method = Method(first.table.numpy(), time_indices, tableau)
     return FlowPlan(network.kernels, folded, method, time_indices.size * network.flops_per_row)

@@ -34,14 +34,13 @@ class MLPLayout(NamedTuple):
     """Where an MLP is in memory.
 
     Addresses of the ``weights`` (n_out, n_in) and ``biases`` (n_out,) of all layers; ``widths``,
-    the outputs of each layer but the last; the activation, see
-    :class:`~sb3_policyflow.kernels.activations.Activation`.
+    the outputs of each layer but the last; the address of the ``activation``, and its parameter.
     """
 
     weights: Integers
     biases: Integers
     widths: Integers
-    kind: int
+    activation: int
     alpha: float
 
 
@@ -64,12 +63,13 @@ class FieldLayout(NamedTuple):
     """Where the embeddings and the first layer of a velocity field are in memory.
 
     The ``dim`` of the points, which are the first inputs of the first layer; the activation of the
-    time embedding; and addresses of the ``frequencies``, and of the weights and biases of the time
-    embedding's hidden and output layer, of the observation embedding, and of the ``first`` layer.
+    time embedding, as in :class:`MLPLayout`; and addresses of the ``frequencies``, and of the
+    weights and biases of the time embedding's hidden and output layer, of the observation
+    embedding, and of the ``first`` layer.
     """
 
     dim: int
-    kind: int
+    activation: int
     alpha: float
     n_frequencies: int
     frequencies: int
@@ -106,7 +106,8 @@ class FoldedNetwork(NamedTuple):
 
     Weights of the first layer for ``points`` (dim, widths[0]) and ``features`` (n_features,
     widths[0]); the ``hidden`` layers behind the first, weights (n_in, n_out) and biases, flat; the
-    layers' ``widths``; weight (dim, widths[-1]) and ``bias`` of the ``output``; the activation.
+    layers' ``widths``; weight (dim, widths[-1]) and ``bias`` of the ``output``; the
+    activation, as in :class:`MLPLayout`.
     """
 
     points: Floats
@@ -115,7 +116,7 @@ class FoldedNetwork(NamedTuple):
     widths: Integers
     output: Floats
     bias: Floats
-    kind: int
+    activation: int
     alpha: np.float32
 
 
@@ -254,6 +255,9 @@ class Kernels(Protocol):
         stop: int,
     ) -> None:
         """Carry some rows of latents to their end points."""
+
+    def activation_address(self, kind: int) -> int:
+        """Where an activation is in memory."""
 
     def are_same(self, addresses: Integers, others: Integers, sizes: Integers) -> bool:
         """Whether arrays have the bits of others."""

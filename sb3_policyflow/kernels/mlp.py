@@ -54,7 +54,7 @@ class MLP:
         self.kernels = kernels
         self.modules = modules
         self.layers = layers
-        self.activation = activation
+        self.activation_layout = kernels.activation_address(activation.kind), activation.alpha
         self.tensors = [tensor for layer in layers for tensor in layer]
         self.held = [tensor.detach() for tensor in self.tensors]
         self.n_parameters = sum(tensor.numel() for tensor in self.held)
@@ -78,14 +78,15 @@ class MLP:
         :param parameters: Weight and bias of each layer.
         """
         places = addresses(parameters)
-        return MLPLayout(places[::2], places[1::2], self.widths, *self.activation)
+        return MLPLayout(places[::2], places[1::2], self.widths, *self.activation_layout)
 
 
 def read_mlp(kernels: Kernels, inspector: ModuleInspector, modules: Iterable[nn.Module]) -> MLP:
     """Read linear layers and the activations between them.
 
+    >>> from sb3_policyflow.kernels.compiler import load_kernels
     >>> modules = [nn.Linear(2, 3), nn.Tanh(), nn.Linear(3, 1)]
-    >>> read_mlp(None, ModuleInspector(), modules).widths
+    >>> read_mlp(load_kernels(), ModuleInspector(), modules).widths
     array([3])
 
     :raises UnsupportedError: If the modules are anything else.

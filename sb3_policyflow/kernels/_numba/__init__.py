@@ -5,6 +5,7 @@ a time through a network to stay in the caches. Get them from
 :func:`sb3_policyflow.kernels.compiler.load_kernels`.
 """
 
+from sb3_policyflow.kernels._numba.activations import activation_address
 from sb3_policyflow.kernels._numba.embedding import embed, embed_backward
 from sb3_policyflow.kernels._numba.flow import flow
 from sb3_policyflow.kernels._numba.losses import loss_gradients
@@ -12,6 +13,7 @@ from sb3_policyflow.kernels._numba.memory import adam, are_same, clip
 from sb3_policyflow.kernels._numba.mlp import backward, forward
 
 __all__ = [
+    "activation_address",
     "adam",
     "are_same",
     "backward",

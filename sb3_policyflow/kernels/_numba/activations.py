@@ -1,14 +1,18 @@
 """Activations: loops over formulas that the compiler turns into vector instructions.
 
-All come down to one exponential, and differ from torch's by a few units in the last place.
+All come down to one exponential, and differ from torch's by a few units in the last place. Each is
+compiled when a network first has it, apart from the kernels, which call it by its address.
 """
 
 import math
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
 
-from sb3_policyflow.kernels._numba.options import F, exact
+from sb3_policyflow.kernels._numba.options import F, called, exact
+from sb3_policyflow.kernels._numba.views import intrinsic, vector
 from sb3_policyflow.kernels.activations import (
     ELU,
     GELU,
@@ -18,11 +22,11 @@ from sb3_policyflow.kernels.activations import (
     LEAKY_RELU,
     MISH,
     RELU,
+    SIGMOID,
     SILU,
     SOFTPLUS,
     TANH,
 )
-from sb3_policyflow.kernels.layouts import Floats
 
 
 @exact
@@ -116,116 +120,199 @@ def _softplus(x: Any, beta: Any) -> Any:
     return x if scaled > F(20.0) else math.log1p(_exp(scaled)) / beta
 
 
-@exact
-def activate(kind: int, alpha: Any, values: Floats) -> None:  # noqa: C901  # one loop for each
-    """Apply an activation in place."""
-    if kind == MISH:
-        for i in range(values.size):
-            _, w, inverse = _mish_parts(values[i])
-            values[i] *= w * inverse
-    elif kind == TANH:
-        for i in range(values.size):
-            values[i] = _tanh(values[i])
-    elif kind == RELU:
-        for i in range(values.size):
-            values[i] = F(0.0) if values[i] < F(0.0) else values[i]
-    elif kind == LEAKY_RELU:
-        for i in range(values.size):
-            values[i] = alpha * values[i] if values[i] < F(0.0) else values[i]
-    elif kind == SILU:
-        for i in range(values.size):
-            values[i] *= _sigmoid(values[i])
-    elif kind == ELU:
-        for i in range(values.size):
-            values[i] = _elu(values[i], alpha)
-    elif kind == GELU:
-        for i in range(values.size):
-            values[i] *= _normal_cdf(values[i])
-    elif kind == GELU_TANH:
-        for i in range(values.size):
-            values[i] *= F(0.5) + F(0.5) * _gelu_parts(values[i])[0]
-    elif kind == SOFTPLUS:
-        for i in range(values.size):
-            values[i] = _softplus(values[i], alpha)
-    elif kind == HARDTANH:
-        for i in range(values.size):
-            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
-            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
-    elif kind != IDENTITY:
-        for i in range(values.size):
-            values[i] = _sigmoid(values[i])
-
-
-@exact
-def _rarer_with_derivatives(  # noqa: C901  # one loop for each
-    kind: int, alpha: Any, values: Floats, derivatives: Floats
-) -> None:
-    if kind == GELU:
-        for i in range(values.size):
-            x = values[i]
-            below = _normal_cdf(x)
-            derivatives[i] = below + x * F(0.39894228) * _exp(F(-0.5) * x * x)
-            values[i] = x * below
-    elif kind == GELU_TANH:
-        for i in range(values.size):
-            x = values[i]
-            t, slope = _gelu_parts(x)
-            derivatives[i] = F(0.5) * (F(1.0) + t + x * (F(1.0) - t * t) * slope)
-            values[i] = x * (F(0.5) + F(0.5) * t)
-    elif kind == SOFTPLUS:
-        for i in range(values.size):
-            scaled = alpha * values[i]
-            derivatives[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
-            values[i] = _softplus(values[i], alpha)
-    elif kind == HARDTANH:
-        for i in range(values.size):
-            derivatives[i] = F(1.0) if abs(values[i]) < F(1.0) else F(0.0)
-            values[i] = F(-1.0) if values[i] < F(-1.0) else values[i]
-            values[i] = F(1.0) if values[i] > F(1.0) else values[i]
-    elif kind == IDENTITY:
-        for i in range(values.size):
-            derivatives[i] = F(1.0)
-    else:
-        for i in range(values.size):
-            values[i] = _sigmoid(values[i])
-            derivatives[i] = values[i] * (F(1.0) - values[i])
-
-
-@exact
-def activate_with_derivatives(  # noqa: C901  # one loop for each
-    kind: int, alpha: Any, values: Floats, derivatives: Floats
-) -> None:
-    """Apply an activation in place, and keep its derivatives.
-
-    mish'(x) = w / (w + 2) + 4 x u (u + 1) / (w + 2)^2
-    """
-    if kind == MISH:
-        for i in range(values.size):
-            u, w, inverse = _mish_parts(values[i])
+@called
+def mish(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    """mish'(x) = w / (w + 2) + 4 x u (u + 1) / (w + 2)^2."""
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            u, w, inverse = _mish_parts(x[i])
             gate = w * inverse
-            derivatives[i] = gate + F(4.0) * values[i] * (u * (u + F(1.0)) * inverse) * inverse
-            values[i] *= gate
-    elif kind == TANH:
-        for i in range(values.size):
-            values[i] = _tanh(values[i])
-            derivatives[i] = F(1.0) - values[i] * values[i]
-    elif kind == RELU:
-        for i in range(values.size):
-            derivatives[i] = F(0.0) if values[i] <= F(0.0) else F(1.0)
-            values[i] = F(0.0) if values[i] < F(0.0) else values[i]
-    elif kind == LEAKY_RELU:
-        for i in range(values.size):
-            derivatives[i] = F(1.0) if values[i] > F(0.0) else alpha
-            values[i] = alpha * values[i] if values[i] < F(0.0) else values[i]
-    elif kind == SILU:
-        for i in range(values.size):
-            gate = _sigmoid(values[i])
-            derivatives[i] = gate * (F(1.0) + values[i] * (F(1.0) - gate))
-            values[i] *= gate
-    elif kind == ELU:
-        for i in range(values.size):
-            y = _elu(values[i], alpha)
-            derivatives[i] = F(1.0) if values[i] > F(0.0) else y + alpha
-            values[i] = y
+            slopes[i] = gate + F(4.0) * x[i] * (u * (u + F(1.0)) * inverse) * inverse
+            x[i] *= gate
     else:
-        _rarer_with_derivatives(kind, alpha, values, derivatives)
+        for i in range(size):
+            _, w, inverse = _mish_parts(x[i])
+            x[i] *= w * inverse
+
+
+@called
+def tanh(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            x[i] = _tanh(x[i])
+            slopes[i] = F(1.0) - x[i] * x[i]
+    else:
+        for i in range(size):
+            x[i] = _tanh(x[i])
+
+
+@called
+def relu(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            slopes[i] = F(0.0) if x[i] <= F(0.0) else F(1.0)
+            x[i] = F(0.0) if x[i] < F(0.0) else x[i]
+    else:
+        for i in range(size):
+            x[i] = F(0.0) if x[i] < F(0.0) else x[i]
+
+
+@called
+def leaky_relu(alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            slopes[i] = F(1.0) if x[i] > F(0.0) else alpha
+            x[i] = alpha * x[i] if x[i] < F(0.0) else x[i]
+    else:
+        for i in range(size):
+            x[i] = alpha * x[i] if x[i] < F(0.0) else x[i]
+
+
+@called
+def silu(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            gate = _sigmoid(x[i])
+            slopes[i] = gate * (F(1.0) + x[i] * (F(1.0) - gate))
+            x[i] *= gate
+    else:
+        for i in range(size):
+            x[i] *= _sigmoid(x[i])
+
+
+@called
+def elu(alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            y = _elu(x[i], alpha)
+            slopes[i] = F(1.0) if x[i] > F(0.0) else y + alpha
+            x[i] = y
+    else:
+        for i in range(size):
+            x[i] = _elu(x[i], alpha)
+
+
+@called
+def gelu(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            below = _normal_cdf(x[i])
+            slopes[i] = below + x[i] * F(0.39894228) * _exp(F(-0.5) * x[i] * x[i])
+            x[i] *= below
+    else:
+        for i in range(size):
+            x[i] *= _normal_cdf(x[i])
+
+
+@called
+def gelu_tanh(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            t, slope = _gelu_parts(x[i])
+            slopes[i] = F(0.5) * (F(1.0) + t + x[i] * (F(1.0) - t * t) * slope)
+            x[i] *= F(0.5) + F(0.5) * t
+    else:
+        for i in range(size):
+            x[i] *= F(0.5) + F(0.5) * _gelu_parts(x[i])[0]
+
+
+@called
+def softplus(alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            scaled = alpha * x[i]
+            slopes[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
+            x[i] = _softplus(x[i], alpha)
+    else:
+        for i in range(size):
+            x[i] = _softplus(x[i], alpha)
+
+
+@called
+def hardtanh(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            slopes[i] = F(1.0) if abs(x[i]) < F(1.0) else F(0.0)
+            x[i] = F(-1.0) if x[i] < F(-1.0) else x[i]
+            x[i] = F(1.0) if x[i] > F(1.0) else x[i]
+    else:
+        for i in range(size):
+            x[i] = F(-1.0) if x[i] < F(-1.0) else x[i]
+            x[i] = F(1.0) if x[i] > F(1.0) else x[i]
+
+
+@called
+def sigmoid(_alpha: Any, values: int, derivatives: int, size: int) -> None:
+    x, slopes = vector(values, size), vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            x[i] = _sigmoid(x[i])
+            slopes[i] = x[i] * (F(1.0) - x[i])
+    else:
+        for i in range(size):
+            x[i] = _sigmoid(x[i])
+
+
+@called
+def identity(_alpha: Any, _values: int, derivatives: int, size: int) -> None:
+    slopes = vector(derivatives, size)
+    if derivatives:
+        for i in range(size):
+            slopes[i] = F(1.0)
+
+
+ACTIVATIONS = {
+    RELU: relu,
+    LEAKY_RELU: leaky_relu,
+    ELU: elu,
+    TANH: tanh,
+    SIGMOID: sigmoid,
+    SILU: silu,
+    MISH: mish,
+    GELU: gelu,
+    GELU_TANH: gelu_tanh,
+    SOFTPLUS: softplus,
+    HARDTANH: hardtanh,
+    IDENTITY: identity,
+}
+"""Each takes its parameter, and addresses of the values, which it changes, and of the derivatives,
+which it fills, or 0 if they are not wanted."""
+
+
+def activation_address(kind: int) -> int:
+    """Where an activation is in memory, compiled.
+
+    :param kind: One of :mod:`sb3_policyflow.kernels.activations`.
+    """
+    dispatcher = ACTIVATIONS[kind]
+    arguments = (types.float32, types.intp, types.intp, types.intp)
+    dispatcher.compile(arguments)
+    compiled = dispatcher.overloads[arguments]
+    address: int = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name)
+    return address
+
+
+@intrinsic
+def activate(
+    _context: Any, _address: Any, _alpha: Any, _values: Any, _derivatives: Any, _size: Any
+) -> Any:
+    """Call what is at an address, one of :data:`ACTIVATIONS`."""
+
+    def codegen(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        address, *others = arguments
+        kind = ir.FunctionType(ir.VoidType(), [argument.type for argument in others])
+        builder.call(builder.inttoptr(address, kind.as_pointer()), others)
+        return context.get_dummy_value()
+
+    size = types.intp
+    return types.void(size, types.float32, size, size, size), codegen

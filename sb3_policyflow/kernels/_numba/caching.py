@@ -39,7 +39,7 @@ class KernelCache(FunctionCache):
                 self.flush()
             found = None
         if found is None:
-            _announce("Compiling the CPU kernels, once after an installation: about 20 seconds.")
+            _announce("Compiling the CPU kernels, once after an installation: about 10 seconds.")
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_policyflow.kernels._numba.matrices import project
-from sb3_policyflow.kernels._numba.memory import matrix, vector
+from sb3_policyflow.kernels._numba.matrices import floats, project
 from sb3_policyflow.kernels._numba.mlp import (
     arranged,
     backward_block,
@@ -25,6 +24,7 @@ from sb3_policyflow.kernels._numba.mlp import (
     total,
 )
 from sb3_policyflow.kernels._numba.options import F, exact, kernel
+from sb3_policyflow.kernels._numba.views import block, matrix, span, vector
 from sb3_policyflow.kernels.layouts import (
     BROWNIAN,
     CHANGE,
@@ -72,38 +72,30 @@ def loss_gradients(
     group, block_rows, widths = rows_of_a_sample(first), rows_of_a_block(first), network.widths
     n_outputs, n_saved = targets.log_std.size if is_actor else 1, total(widths)
     most = min(block_rows, (stop - start) * group)
-    values, derivatives = np.empty(most * n_saved, F), np.empty(most * n_saved, F)
-    outputs, grad_outputs = np.empty((most, n_outputs), F), np.empty((most, n_outputs), F)
+    values, derivatives = floats(most * n_saved), floats(most * n_saved)
+    outputs, grad_outputs = floats(most * n_outputs), floats(most * n_outputs)
     scratch, hidden = backward_scratch(network, most), arranged(network)
     weight = matrix(network.weights[-1], n_outputs, widths[-1])
     bias = vector(network.biases[-1], n_outputs)
     n_others = gradients.others.size - (n_outputs if is_actor else 0)
-    of_layers, of_log_std = gradients.others[:n_others], gradients.others[n_others:]
+    of_layers = span(gradients.others, 0, n_others)
+    of_log_std = span(gradients.others, n_others, gradients.others.size - n_others)
     for begin in range(start * group, stop * group, block_rows):
         end = min(begin + block_rows, stop * group)
-        rows = end - begin
-        of_values, of_derivatives = values[: rows * n_saved], derivatives[: rows * n_saved]
-        first_layer(first, begin, end, of_values[: rows * widths[0]].reshape((rows, widths[0])))
+        n_rows, size = end - begin, (end - begin) * n_saved
+        of_values, of_derivatives = span(values, 0, size), span(derivatives, 0, size)
+        found = block(outputs, 0, n_rows, n_outputs)
+        grads = block(grad_outputs, 0, n_rows, n_outputs)
+        first_layer(first, begin, end, block(values, 0, n_rows, widths[0]))
         last = hidden_layers(
-            hidden, widths, network.kind, F(network.alpha), of_values, of_derivatives
+            hidden, widths, network.activation, F(network.alpha), of_values, of_derivatives
         )
-        project(last, weight, bias, outputs[:rows])
+        project(last, weight, bias, found)
         if is_actor:
-            _actor_loss(
-                first,
-                targets,
-                options,
-                outputs[:rows],
-                grad_outputs[:rows],
-                of_log_std,
-                sums,
-                begin,
-            )
+            _actor_loss(first, targets, options, found, grads, of_log_std, sums, begin)
         else:
-            _critic_loss(targets, options, outputs[:rows], grad_outputs[:rows], sums, begin)
-        grad = backward_block(
-            network, of_values, of_derivatives, grad_outputs[:rows], of_layers, scratch
-        )
+            _critic_loss(targets, options, found, grads, sums, begin)
+        grad = backward_block(network, of_values, of_derivatives, grads, of_layers, scratch)
         first_layer_backward(first, begin, end, grad, gradients)
 
 
@@ -143,7 +135,7 @@ def _actor_loss(
     group, (n_rows, dim) = rows_of_a_sample(first), velocity.shape
     # Rows whose mean shift has one surrogate
     together = group if options.averages_shift else 1
-    shift = np.empty(dim, F)
+    shift = floats(dim)
     for row in range(0, n_rows, together):
         sample = (begin + row) // group
         for i in range(dim):

@@ -16,12 +16,24 @@ from sb3_policyflow.kernels._numba.tiles import (
     tall_slim,
     tall_wide,
 )
+from sb3_policyflow.kernels._numba.views import block, span, strided, turned
 from sb3_policyflow.kernels.layouts import Floats
 
 
 @inner
 def accumulate(inputs: Any, weights: Floats, outputs: Floats) -> None:
-    """Outputs += inputs @ weights, where rows of weights and outputs are contiguous."""
+    """Outputs += inputs @ weights, of which weights and outputs are contiguous."""
+    _accumulate(strided(inputs), weights, outputs)
+
+
+@inner
+def accumulate_turned(inputs: Any, weights: Floats, outputs: Floats) -> None:
+    """Outputs += inputs.T @ weights, likewise."""
+    _accumulate(turned(inputs), weights, outputs)
+
+
+@inner
+def _accumulate(inputs: Any, weights: Floats, outputs: Floats) -> None:
     n_rows, n_columns = outputs.shape
     n_tall = n_rows - n_rows % TALL
     for row in range(0, n_tall, TALL):
@@ -77,26 +89,46 @@ def project(inputs: Floats, weights: Floats, bias: Floats, outputs: Floats) -> N
 
 
 @inner
-def product(inputs: Any, weights: Floats) -> Floats:
-    """The matrix inputs @ weights."""
-    outputs = np.empty((inputs.shape[0], weights.shape[1]), F)
+def floats(size: int) -> Floats:
+    """Space for so many numbers."""
+    return np.empty(size, F)
+
+
+@inner
+def zeros(n_rows: int, n_columns: int) -> Floats:
+    """A matrix of zeros."""
+    outputs = block(floats(n_rows * n_columns), 0, n_rows, n_columns)
     clear(outputs)
+    return outputs
+
+
+@inner
+def product(inputs: Floats, weights: Floats) -> Floats:
+    """The matrix inputs @ weights."""
+    outputs = zeros(inputs.shape[0], weights.shape[1])
     accumulate(inputs, weights, outputs)
     return outputs
 
 
 @inner
-def transposed(matrix: Any) -> Floats:
+def transposed(matrix: Floats) -> Floats:
     """The transposed matrix, laid out row by row."""
     n_rows, n_columns = matrix.shape
-    outputs = np.empty((n_columns, n_rows), F)
+    outputs = block(floats(matrix.size), 0, n_columns, n_rows)
+    transpose(matrix, outputs)
+    return outputs
+
+
+@inner
+def transpose(matrix: Floats, outputs: Floats) -> None:
+    """Outputs = matrix.T."""
+    n_rows, n_columns = matrix.shape
     # Strips of 16 rows: as many lines of the cache, each used 16 times, make one of the outputs.
     for start in range(0, n_rows, 16):
         stop = min(start + 16, n_rows)
         for i in range(n_columns):
             for j in range(start, stop):
                 outputs[i, j] = matrix[j, i]
-    return outputs
 
 
 @inner
@@ -123,6 +155,6 @@ def multiply(target: Any, factors: Any) -> None:
 @inner
 def clear(target: Any) -> None:
     """Fill a matrix with zeros."""
-    for row in range(target.shape[0]):
-        for j in range(target.shape[1]):
-            target[row, j] = F(0.0)
+    numbers = span(target, 0, target.size)
+    for i in range(numbers.size):
+        numbers[i] = F(0.0)

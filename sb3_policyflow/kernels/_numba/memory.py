@@ -1,52 +1,22 @@
 """Parameters and gradients where they are in memory."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import carray, types
-from numba.extending import intrinsic
 
-from sb3_policyflow.kernels._numba.options import F, inner, kernel
-from sb3_policyflow.kernels.layouts import AdamOptions, Floats, Integers
-
-
-def _pointer_to(number: Any) -> Any:
-    """Make the function that takes an address for a pointer to numbers of a type."""
-
-    def pointer(_context: Any, address: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
-
-        return types.CPointer(number)(address), codegen
-
-    return intrinsic(pointer)
-
+from sb3_policyflow.kernels._numba.options import F, kernel
+from sb3_policyflow.kernels._numba.views import bits, vector
+from sb3_policyflow.kernels.layouts import AdamOptions, Integers
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-
-_floats = _pointer_to(types.float32)
-_bits = _pointer_to(types.int32)
-
-
-@inner
-def vector(address: int, size: int) -> Floats:
-    """The numbers at an address."""
-    return carray(_floats(address), (size,))
-
-
-@inner
-def matrix(address: int, n_rows: int, n_columns: int) -> Floats:
-    """The matrix at an address."""
-    return carray(_floats(address), (n_rows, n_columns))
 
 
 @kernel
 def are_same(addresses: Integers, others: Integers, sizes: Integers) -> bool:
     """Whether the numbers at some addresses have the bits of those at others."""
     for place in range(addresses.size):
-        numbers = carray(_bits(addresses[place]), (sizes[place],))
-        other_numbers = carray(_bits(others[place]), (sizes[place],))
+        numbers = bits(addresses[place], sizes[place])
+        other_numbers = bits(others[place], sizes[place])
         difference = np.int32(0)
         for i in range(numbers.size):
             difference |= numbers[i] ^ other_numbers[i]

@@ -2,21 +2,23 @@
 
 from typing import Any
 
-import numpy as np
-
-from sb3_policyflow.kernels._numba.activations import activate, activate_with_derivatives
+from sb3_policyflow.kernels._numba.activations import activate
 from sb3_policyflow.kernels._numba.matrices import (
     accumulate,
+    accumulate_turned,
     add,
     clear,
     copy,
+    floats,
     multiply,
     product,
     project,
+    transpose,
     transposed,
+    zeros,
 )
-from sb3_policyflow.kernels._numba.memory import matrix, vector
 from sb3_policyflow.kernels._numba.options import ROWS, F, inner, kernel
+from sb3_policyflow.kernels._numba.views import block, matrix, place, rows, span, vector
 from sb3_policyflow.kernels.layouts import (
     Floats,
     Integers,
@@ -28,35 +30,38 @@ from sb3_policyflow.kernels.layouts import (
 
 @inner
 def hidden_layers(
-    weights: Floats, widths: Integers, kind: int, alpha: Any, values: Floats, derivatives: Floats
+    weights: Floats,
+    widths: Integers,
+    activation: int,
+    alpha: Any,
+    values: Floats,
+    derivatives: Floats,
 ) -> Any:
     """Carry a block of rows from the first layer to the last activation.
 
     :param weights: For each layer behind the first its weights (n_in, n_out) and biases, flat.
     :param widths: Outputs of each layer.
-    :param kind: The activation.
+    :param activation: The activation's address.
     :param alpha: Its parameter.
     :param values: Space for the activations of all layers, flat; holds what the first layer yields.
     :param derivatives: Space for their derivatives; of size 0 if they are not wanted.
     :return: The last layer's activations, shape (rows, widths[-1]).
     """
-    rows = values.size // total(widths)
-    start, end, used = 0, rows * widths[0], 0
-    outputs = values[:end].reshape((rows, widths[0]))
+    n_rows = values.size // total(widths)
+    start, end, used = 0, n_rows * widths[0], 0
+    outputs = block(values, 0, n_rows, widths[0])
     for layer in range(widths.size):
         if layer > 0:
             n_in, n_out = widths[layer - 1], widths[layer]
-            start, end = end, end + rows * n_out
-            inputs, outputs = outputs, values[start:end].reshape((rows, n_out))
-            weight_end = used + n_in * n_out
-            for row in range(rows):
-                copy(weights[weight_end : weight_end + n_out], outputs[row])
-            accumulate(inputs, weights[used:weight_end].reshape((n_in, n_out)), outputs)
-            used = weight_end + n_out
-        if derivatives.size > 0:
-            activate_with_derivatives(kind, alpha, values[start:end], derivatives[start:end])
-        else:
-            activate(kind, alpha, values[start:end])
+            start, end = end, end + n_rows * n_out
+            inputs, outputs = outputs, block(values, start, n_rows, n_out)
+            bias = span(weights, used + n_in * n_out, n_out)
+            for row in range(n_rows):
+                copy(bias, outputs[row])
+            accumulate(inputs, block(weights, used, n_in, n_out), outputs)
+            used += (n_in + 1) * n_out
+        wanted = 0 if derivatives.size == 0 else place(derivatives, start)
+        activate(activation, alpha, place(outputs, 0), wanted, outputs.size)
     return outputs
 
 
@@ -76,14 +81,15 @@ def arranged(network: MLPLayout) -> Floats:
     size = 0
     for layer in range(1, widths.size):
         size += (widths[layer - 1] + 1) * widths[layer]
-    weights = np.empty(size, F)
+    weights = floats(size)
     end = 0
     for layer in range(1, widths.size):
         n_in, n_out = widths[layer - 1], widths[layer]
-        weight = transposed(matrix(network.weights[layer], n_out, n_in))
-        copy(weight.reshape(-1), weights[end:])
-        copy(vector(network.biases[layer], n_out), weights[end + n_in * n_out :])
-        end += (n_in + 1) * n_out
+        weight = matrix(network.weights[layer], n_out, n_in)
+        transpose(weight, block(weights, end, n_in, n_out))
+        end += n_in * n_out
+        copy(vector(network.biases[layer], n_out), span(weights, end, n_out))
+        end += n_out
     return weights
 
 
@@ -106,8 +112,9 @@ def first_layer(first: KernelInput, begin: int, end: int, layer: Floats) -> None
     n_points, group = first.points.shape[1], rows_of_a_sample(first)
     for row in range(begin, end):
         copy(first.table[first.entries[row] if first.entries.size > 0 else 0], layer[row - begin])
-    accumulate(first.points[begin:end], first.weights[:n_points], layer)
-    features, weights = first.features[begin // group : end // group], first.weights[n_points:]
+    accumulate(rows(first.points, begin, end), rows(first.weights, 0, n_points), layer)
+    features = rows(first.features, begin // group, end // group)
+    weights = rows(first.weights, n_points, first.weights.shape[0])
     if group == 1:
         accumulate(features, weights, layer)
     else:
@@ -126,26 +133,28 @@ def first_layer_backward(
     """
     (n_points, n_features), width = (first.points.shape[1], first.features.shape[1]), grad.shape[1]
     n_inputs, group = n_points + n_features, rows_of_a_sample(first)
-    weights = gradients.first[: n_inputs * width].reshape((n_inputs, width))
-    table = gradients.first[n_inputs * width :]
+    table = n_inputs * width
     for row in range(begin, end):
         entry = first.entries[row] if first.entries.size > 0 else 0
-        add(grad[row - begin], table[entry * width : (entry + 1) * width])
-    accumulate(first.points[begin:end].T, grad, weights[:n_points])
+        add(grad[row - begin], span(gradients.first, table + entry * width, width))
+    of_points = block(gradients.first, 0, n_points, width)
+    accumulate_turned(rows(first.points, begin, end), grad, of_points)
     if gradients.points.shape[0] > 0:
-        no_bias = np.zeros(n_points, F)
-        project(grad, first.weights[:n_points], no_bias, gradients.points[begin:end])
+        no_bias = span(zeros(1, n_points), 0, n_points)
+        project(grad, rows(first.weights, 0, n_points), no_bias, rows(gradients.points, begin, end))
     of_samples = grad
     if group > 1:
-        of_samples = np.zeros(((end - begin) // group, width), F)
+        of_samples = zeros((end - begin) // group, width)
         for row in range(end - begin):
             add(grad[row], of_samples[row // group])
-    features = first.features[begin // group : end // group]
-    accumulate(features.T, of_samples, weights[n_points:])
+    features = rows(first.features, begin // group, end // group)
+    of_features = block(gradients.first, n_points * width, n_features, width)
+    accumulate_turned(features, of_samples, of_features)
     if gradients.features.shape[0] > 0:
-        grad_features = gradients.features[begin // group : end // group]
+        grad_features = rows(gradients.features, begin // group, end // group)
         clear(grad_features)
-        accumulate(of_samples, transposed(first.weights[n_points:]), grad_features)
+        weights = transposed(rows(first.weights, n_points, n_inputs))
+        accumulate(of_samples, weights, grad_features)
 
 
 @kernel
@@ -173,19 +182,17 @@ def forward(
     hidden = arranged(network)
     weight = matrix(network.weights[-1], outputs.shape[1], widths[-1])
     bias = vector(network.biases[-1], outputs.shape[1])
-    workspace = np.empty(min(block_rows, stop - start) * n_saved, F)
+    workspace = floats(min(block_rows, stop - start) * n_saved)
     for begin in range(start, stop, block_rows):
         end = min(begin + block_rows, stop)
-        block = workspace[: (end - begin) * n_saved]
-        derivatives_block = derivatives[begin * n_saved : end * n_saved]
+        size = (end - begin) * n_saved
+        of_block, slopes = span(workspace, 0, size), span(derivatives, 0, 0)
         if derivatives.size > 0:
-            block = values[begin * n_saved : end * n_saved]
-        layer = block[: (end - begin) * widths[0]].reshape((end - begin, widths[0]))
-        first_layer(first, begin, end, layer)
-        last = hidden_layers(
-            hidden, widths, network.kind, F(network.alpha), block, derivatives_block
-        )
-        project(last, weight, bias, outputs[begin:end])
+            of_block = span(values, begin * n_saved, size)
+            slopes = span(derivatives, begin * n_saved, size)
+        first_layer(first, begin, end, block(of_block, 0, end - begin, widths[0]))
+        last = hidden_layers(hidden, widths, network.activation, F(network.alpha), of_block, slopes)
+        project(last, weight, bias, rows(outputs, begin, end))
 
 
 @kernel
@@ -216,9 +223,9 @@ def backward(
         end = min(begin + block_rows, stop)
         grad = backward_block(
             network,
-            values[begin * n_saved : end * n_saved],
-            derivatives[begin * n_saved : end * n_saved],
-            grad_outputs[begin:end],
+            span(values, begin * n_saved, (end - begin) * n_saved),
+            span(derivatives, begin * n_saved, (end - begin) * n_saved),
+            rows(grad_outputs, begin, end),
             gradients.others,
             scratch,
         )
@@ -226,12 +233,12 @@ def backward(
 
 
 @inner
-def backward_scratch(network: MLPLayout, rows: int) -> Floats:
+def backward_scratch(network: MLPLayout, n_rows: int) -> Floats:
     """Space for the gradients of two layers."""
     widest = 0
     for width in network.widths:
         widest = max(widest, width)
-    return np.empty((2, rows * widest), F)
+    return floats(2 * n_rows * widest)
 
 
 @inner
@@ -246,24 +253,26 @@ def backward_block(
     """Add the gradients of all layers but the first.
 
     :param grads: Those of weight and bias of each layer behind the first, flat.
-    :param scratch: Space for the gradients of two layers, shape (2, rows * the widest).
-    :return: The gradient of what the first layer yields, shape (rows, widths[0]).
+    :param scratch: Space for the gradients of two layers, flat.
+    :return: The gradient of what the first layer yields, shape (n, widths[0]).
     """
-    rows, n_out = grad_outputs.shape
+    n_rows, n_out = grad_outputs.shape
     end, used = values.size, grads.size
     grad, side = grad_outputs, 0
     for layer in range(network.widths.size, 0, -1):
         n_in = network.widths[layer - 1]
-        begin = end - rows * n_in
+        size = n_rows * n_in
+        end -= size
         used -= n_out
-        for row in range(rows):
-            add(grad[row], grads[used : used + n_out])
+        grad_bias = span(grads, used, n_out)
+        for row in range(n_rows):
+            add(grad[row], grad_bias)
         used -= n_in * n_out
-        grad_weight = grads[used : used + n_in * n_out].reshape((n_out, n_in))
-        accumulate(grad.T, values[begin:end].reshape((rows, n_in)), grad_weight)
-        grad_input = scratch[side, : rows * n_in].reshape((rows, n_in))
+        grad_weight = block(grads, used, n_out, n_in)
+        accumulate_turned(grad, block(values, end, n_rows, n_in), grad_weight)
+        grad_input = block(scratch, side, n_rows, n_in)
         clear(grad_input)
         accumulate(grad, matrix(network.weights[layer], n_out, n_in), grad_input)
-        multiply(grad_input.reshape(-1), derivatives[begin:end])
-        grad, side, end, n_out = grad_input, 1 - side, begin, n_in
+        multiply(span(grad_input, 0, size), span(derivatives, end, size))
+        grad, side, n_out = grad_input, scratch.size // 2 - side, n_in
     return grad

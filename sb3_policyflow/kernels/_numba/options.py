@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from sb3_policyflow.kernels._numba.caching import KernelCache
+from sb3_policyflow.kernels._numba.parts import PartCompiler
 
 F = np.float32
 ROWS = 64
@@ -18,8 +19,12 @@ the time of a flow or of gradients with hidden layers [256, 128, 64], and 0.89 t
 
 # Divisions by zero give infinity, as in torch, and threads may run beside each other.
 _COMMON: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-# What only kernels call needs no way in from Python, which takes time to compile.
-_INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# Each way in takes time to compile.
+_PART: dict[str, Any] = {
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "pipeline_class": PartCompiler,
+}
 _EXACT: dict[str, Any] = {"fastmath": {"contract"}}
 _SUMS: dict[str, Any] = {"fastmath": {"contract", "nsz", "reassoc"}}
 
@@ -36,9 +41,11 @@ def _compiler(**options: Any) -> Any:
     return decorate
 
 
-kernel = _compiler(**_SUMS)
+kernel = _compiler(no_cfunc_wrapper=True, **_SUMS)
 """Called from Python."""
-inner = _compiler(**_INNER, **_SUMS)
-"""Called by kernels; adds up in any order, as a BLAS does."""
-exact = _compiler(**_INNER, **_EXACT)
-"""Called by kernels; computes as it is written, up to fused multiply-adds."""
+called = _compiler(no_cpython_wrapper=True, **_EXACT)
+"""Called by kernels at its address."""
+inner = njit(**_COMMON, **_PART, **_SUMS)
+"""Part of a kernel; adds up in any order, as a BLAS does."""
+exact = njit(**_COMMON, **_PART, **_EXACT)
+"""Part of a kernel; computes as it is written, up to fused multiply-adds."""
