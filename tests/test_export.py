@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
+import sb3_policyflow
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.export import ActionModule, export
 from sb3_policyflow.export.__main__ import main
@@ -203,6 +205,19 @@ def test_the_module_itself_and_the_bounds_of_actions(algorithm: type[Any], bound
         model.policy.velocity.output.bias.fill_(100.0)
     obs = th.as_tensor(np.stack([model.observation_space.sample() for _ in range(4)]))
     assert (ActionModule(model.policy)(obs) == bound).all()
+
+
+@pytest.mark.parametrize("kind", ["onnx", "pt2"])
+def test_no_folder_of_this_machine_is_in_the_file(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"policy.{kind}"
+    export(PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY).policy, path)
+    written = path.read_bytes()
+    if kind == "pt2":
+        with zipfile.ZipFile(path) as archive:
+            written = b"".join(archive.read(name) for name in archive.namelist())
+    assert b"velocity" in written  # names of parameters can be read
+    for module in (sb3_policyflow, th):
+        assert str(Path(module.__file__ or "").parent).encode() not in written
 
 
 def test_what_cannot_be_exported(tmp_path: Path) -> None:

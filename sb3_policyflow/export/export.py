@@ -65,10 +65,19 @@ def export(
     example = module.example(latents)
     with th.no_grad(), _quiet():
         program = th.export.export(module, example, dynamic_shapes=_any_batch(example))
+        _forget_source(program)
         if path.suffix == ".pt2":
             th.export.save(program, path)
         else:
             _write_onnx(program, example, path)
+
+
+def _forget_source(program: th.export.ExportedProgram) -> None:
+    """Remove PyTorch's notes of where operators came from, with folders of this machine."""
+    for module in program.graph_module.modules():
+        if isinstance(module, th.fx.GraphModule):
+            for node in module.graph.nodes:
+                node.meta.pop("stack_trace", None)
 
 
 def _require_onnx() -> None:
