@@ -33,6 +33,7 @@ from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import NotFiniteError
 
 NetArch = list[int] | dict[str, list[int]]
+LatentsAndEnds = tuple[th.Tensor, th.Tensor | None]
 
 
 class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
@@ -243,17 +244,16 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
     def latent_scale(self) -> float | th.Tensor:
         """Standard deviation of the latents: a number, or one for each dimension of the action."""
 
-    def draw_latents(self, features: th.Tensor, deterministic: bool) -> th.Tensor:
-        """Latents z ~ N(0, latent_scale^2) or the deterministic action's, shape (n, action_dim)."""
-        scale = self.latent_scale
-        is_zero = deterministic and self.deterministic_action == "zero"
-        if is_zero or (isinstance(scale, float) and scale == 0.0):
-            return features.new_zeros(features.shape[0], self.action_dim)
-        if not deterministic or self.deterministic_action == "drawn":
+    def draw_latents(self, features: th.Tensor, deterministic: bool) -> LatentsAndEnds:
+        """Latents z ~ N(0, latent_scale^2) or the deterministic action's; their ends, if known."""
+        scale, choice = self.latent_scale, self.deterministic_action
+        if (deterministic and choice == "zero") or (isinstance(scale, float) and scale == 0.0):
+            return features.new_zeros(features.shape[0], self.action_dim), None
+        if not deterministic or choice == "drawn":
             size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
-            return scale * th.randn(size, device=features.device, dtype=features.dtype)
+            return scale * th.randn(size, device=features.device, dtype=features.dtype), None
         candidates = scale * candidate_latents(self.action_dim).to(features)
-        return candidates[densest_endpoints(self.transport, candidates, features)]
+        return densest_endpoints(self.transport, candidates, features)
 
     @property
     @abstractmethod

@@ -258,7 +258,7 @@ class DPPOPolicy(FlowPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, DPPORecord]:
         """Draw actions; in deterministic ones each step goes to its mean."""
-        latents = self.draw_latents(features, deterministic)
+        latents, _ = self.draw_latents(features, deterministic)
         points, means = self._chain(latents, features, is_noisy=not deterministic)
         record = DPPORecord(
             th.stack(points[self.n_frozen_steps :], dim=1),

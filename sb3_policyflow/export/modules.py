@@ -109,9 +109,11 @@ class ActionModule(nn.Module):
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
+        found = None
         if latents is None:
-            latents = self.policy.draw_latents(features, deterministic=True)
-        actions = self.policy.transport(latents, features).reshape(-1, *self.low.shape)
+            latents, found = self.policy.draw_latents(features, deterministic=True)
+        actions = self.policy.transport(latents, features) if found is None else found
+        actions = actions.reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)
         return actions.clamp(self.low, self.high)

@@ -46,19 +46,21 @@ def densest_endpoints(
     transport: Callable[[th.Tensor, th.Tensor], th.Tensor],
     latents: th.Tensor,
     features: th.Tensor,
-) -> th.Tensor:
+) -> tuple[th.Tensor, th.Tensor]:
     """For each observation, the latent whose end point has the most others around it.
 
     :param transport: The flow, a function of latents (n k, d) and features (n k, features_dim).
     :param latents: The same k latents for all observations, shape (k, d).
     :param features: Features of n observations, shape (n, features_dim).
-    :return: Indices of latents, shape (n,).
+    :return: The latents and their end points, each of shape (n, d).
     """
     n, k = features.shape[0], latents.shape[0]
     # Contiguous, as kernels take it: of one observation it would be a view.
     repeated = features.unsqueeze(1).expand(-1, k, -1).flatten(0, 1).contiguous()
-    endpoints = transport(latents.repeat(n, 1), repeated)
-    return densest(endpoints.reshape(n, k, endpoints.shape[-1]))
+    endpoints = transport(latents.repeat(n, 1), repeated).reshape(n, k, -1)
+    chosen = densest(endpoints)
+    rows = th.arange(n, device=chosen.device)
+    return latents[chosen], endpoints[rows, chosen]
 
 
 def candidate_latents(dim: int) -> th.Tensor:

@@ -89,7 +89,8 @@ class FPOPolicy(FlowPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, NoRecord]:
         """Draw actions; deterministic ones have no noise (FPO++: with "zero", zero-sampling)."""
-        actions = self.transport(self.draw_latents(features, deterministic), features)
+        latents, found = self.draw_latents(features, deterministic)
+        actions = self.transport(latents, features) if found is None else found
         if self.action_noise_std > 0 and not deterministic:
             actions = actions + self.action_noise_std * th.randn_like(actions)
         return actions, NoRecord()

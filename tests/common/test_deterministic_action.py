@@ -78,7 +78,9 @@ def test_is_an_action_of_the_policy_and_repeatable(algorithm: type[Any]) -> None
     policy = model.policy
     with th.no_grad():
         features = policy.actor_features(th.as_tensor(obs))
-        latents = policy.draw_latents(features, deterministic=True)
+        latents, endpoints = policy.draw_latents(features, deterministic=True)
+        assert endpoints is not None
+        assert th.equal(policy.transport(latents, features), endpoints)
         candidates = policy.latent_scale * candidate_latents(policy.action_dim)
         assert all((candidates == latent).all(dim=1).any() for latent in latents)
         module = ActionModule(policy)

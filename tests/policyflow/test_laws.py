@@ -226,7 +226,7 @@ def test_latents_are_in_proportion_to_the_action_space() -> None:
     policy = PolicyFlowPolicy(spaces.Box(-1, 1, (3,)), space, lambda _: 1e-3)
     expected = th.tensor([0.2, 0.4, 0.3, 1.0, 1.0])
     th.testing.assert_close(policy.latent_scale, expected)
-    latents = policy.draw_latents(th.zeros(50_000, 3), deterministic=False)
+    latents, _ = policy.draw_latents(th.zeros(50_000, 3), deterministic=False)
     th.testing.assert_close(latents.std(dim=0), expected, rtol=0.02, atol=0)
     multigoal = PolicyFlowPolicy(spaces.Box(-1, 1, (4,)), spaces.Box(-5, 5, (2,)), lambda _: 1e-3)
     assert multigoal.latent_scale == 1.0
