@@ -47,6 +47,8 @@ class RecordBufferMixin(RolloutBuffer):
         """Forget all transitions."""
         self.record_type = None
         self.pending_bonus = None
+        # NaN shows at once where log probabilities are read from this buffer by mistake.
+        self._no_log_prob = th.full((self.n_envs,), th.nan, dtype=th.float32, device="cpu")
         super().reset()
         # SB3 stores actions in the dtype of the space, which may have less than single precision.
         self.actions = self.actions.astype(np.float32, copy=False)
@@ -73,14 +75,12 @@ class RecordBufferMixin(RolloutBuffer):
             )
         if self.record_type is None:
             self._allocate(record)
-        for name, values in record._asdict().items():
+        for name, values in zip(record._fields, record, strict=True):
             getattr(self, name)[self.pos] = values.cpu().numpy()
         if self.pending_bonus is not None:
             reward = self.pending_bonus.settle(reward)
             self.pending_bonus = None
-        # NaN shows at once where log probabilities are read from this buffer by mistake.
-        no_log_prob = th.full((self.n_envs,), th.nan, dtype=th.float32, device="cpu")
-        super().add(obs, action, reward, episode_start, value, no_log_prob)
+        super().add(obs, action, reward, episode_start, value, self._no_log_prob)
 
     def _allocate(self, record: Any) -> None:
         self.record_type = type(record)
