@@ -32,6 +32,7 @@ from sb3_policyflow.device import environments
 from sb3_policyflow.distributed.ranks import Ranks, join, training_of
 from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
+from sb3_policyflow.resilience.training import LearnArguments
 
 
 class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
@@ -314,7 +315,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     ) -> Self:
         """Train for ``total_timesteps``; see SB3. Runs are named after the class by default."""
         options.take_up_changes(self)
-        name = tb_log_name or type(self).__name__
-        arguments = total_timesteps, callback, log_interval, name
-        training_of(self).run(super().learn, *arguments, reset_num_timesteps, progress_bar)
+        rest = log_interval, tb_log_name or type(self).__name__, reset_num_timesteps, progress_bar
+        training_of(self).run(super().learn, LearnArguments(total_timesteps, callback, *rest))
         return self

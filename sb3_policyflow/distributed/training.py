@@ -10,13 +10,12 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_policyflow.distributed import restart
 from sb3_policyflow.distributed.callback import RankCallback, as_callback, without_outputs
 from sb3_policyflow.distributed.group import ProcessGroup, process_group
 from sb3_policyflow.distributed.statistics import MergedStatistics, running_statistics
-from sb3_policyflow.resilience.training import Training, TrainingAlone
+from sb3_policyflow.resilience.training import LearnArguments, Training, TrainingAlone
 
 OWN = {"env", "policy", "seed", "verbose", "tensorboard_log", "device", "stats_window_size"}
 """Arguments in which the ranks may differ, or that cannot be compared."""
@@ -59,34 +58,27 @@ class SharedTraining(Training):
         self._callback: RankCallback
         self._statistics: MergedStatistics
 
-    def run(
-        self,
-        learn: Callable[..., object],
-        total_timesteps: int,
-        callback: MaybeCallback,
-        log_interval: int,
-        tb_log_name: str,
-        reset_num_timesteps: bool,
-        progress_bar: bool,
-    ) -> None:
+    def run(self, learn: Callable[..., object], arguments: LearnArguments) -> None:
         """Call SB3's ``learn`` on every rank, and end all if one of them ends with an error.
 
-        :param learn: SB3's, of this rank's model; the other arguments are its own.
+        :param learn: SB3's, of this rank's model.
+        :param arguments: Its arguments.
         :raises RankError: If another rank has stopped with an error.
         :raises ValueError: If the ranks differ, or something cannot be shared out.
         """
         model, group = self.model, self.group
+        n_steps, is_new = arguments.total_timesteps, arguments.reset_num_timesteps
         with self._of_model(), group.together():
             group.connect(model.device)
-            self._check(total_timesteps)
-            callback = as_callback(callback, progress_bar)
-            end = total_timesteps if reset_num_timesteps else total_timesteps + model.num_timesteps
+            self._check(n_steps)
+            callback = as_callback(arguments.callback, arguments.progress_bar)
+            end = n_steps if is_new else n_steps + model.num_timesteps
             model.run_id = group.from_first(restart.run_id())
             if restart.take_up(model, group, callback):
-                total_timesteps, reset_num_timesteps = max(end - model.num_timesteps, 0), False
+                n_steps, is_new = max(end - model.num_timesteps, 0), False
             self._start_alike()
-            arguments = total_timesteps, self._around(callback), log_interval, tb_log_name
-            learn(*arguments, reset_num_timesteps, progress_bar=False)
+            rest = arguments.log_interval, arguments.tb_log_name, is_new
+            learn(n_steps, self._around(callback), *rest, progress_bar=False)
 
     @contextmanager
     def _of_model(self) -> Iterator[None]:
