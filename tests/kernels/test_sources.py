@@ -183,7 +183,7 @@ def test_compiling_is_announced_once_and_only_where_nothing_is_kept(
         said.append([message for message in caplog.messages if "Compiling" in message])
         caplog.clear()
     assert said == [
-        ["Compiling the CPU kernels, once after an installation: about 20 seconds."],
+        ["Compiling the CPU kernels, once after an installation: about 10 seconds."],
         [],
     ]
 
