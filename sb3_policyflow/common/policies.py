@@ -239,6 +239,15 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
             values = self.value_net(self.mlp_extractor.forward_critic(features))
         return values
 
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        """Estimated values of states, shape (n, 1), by kernels as in :meth:`forward`.
+
+        The few states of a rollout that need them then wake no threads of torch, which would keep
+        the cores from the kernels that sample.
+        """
+        extract = super(ActorCriticPolicy, self).extract_features  # as SB3 does
+        return self.values(extract(obs, self.vf_features_extractor))
+
     @property
     @abstractmethod
     def latent_scale(self) -> float | th.Tensor:
