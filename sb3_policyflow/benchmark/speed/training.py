@@ -18,6 +18,7 @@ import torch as th
 from sb3_policyflow.benchmark.errors import BenchmarkError
 from sb3_policyflow.benchmark.measure.provenance import machine
 from sb3_policyflow.benchmark.report.markdown import markdown_table
+from sb3_policyflow.benchmark.speed.rivals import command as rivals
 from sb3_policyflow.benchmark.speed.settings import GROWTH, MAIN, halfcheetah, isaaclab
 from sb3_policyflow.benchmark.speed.timing import PARTS, peak_memory, time_calls, time_setting
 
@@ -138,16 +139,20 @@ def measure(what: str, repetitions: int, device: str) -> tuple[Any, str]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     choices, default = ", ".join(CHOICES), ", ".join(DEFAULT)
-    parser.add_argument("what", nargs="*", help=f"of {choices}; default: {default}")
+    what = f"of {choices}, or rivals alone; default: {default}"
+    parser.add_argument("what", nargs="*", help=what)
     parser.add_argument("--repetitions", type=int, default=5, help="default: 5")
     parser.add_argument("--threads", type=int, help="torch's threads; default: torch's own")
     parser.add_argument("--device", default="auto", help='of "isaaclab"; default: a GPU if any')
     parser.add_argument("--out", type=Path, help="a JSON file for all figures")
     parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
+    rivals.add_arguments(parser)
 
 
 def main(arguments: argparse.Namespace) -> int:
     """Measure, write tables to the terminal and figures to a file."""
+    if arguments.what == ["rivals"]:
+        return rivals.main(arguments)
     unknown = set(arguments.what) - set(CHOICES)
     if unknown:
         raise BenchmarkError(f"Cannot measure {sorted(unknown)}: choose from {', '.join(CHOICES)}.")
