@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_policyflow import PolicyFlow
 from sb3_policyflow.kernels import flow
 from sb3_policyflow.kernels.inspection import KernelView
 from tests.helpers import SMALL, TINY
@@ -205,3 +207,14 @@ def test_a_thread_may_outlive_the_main_thread() -> None:
         [sys.executable, "-c", AFTER_THE_MAIN_THREAD], capture_output=True, text=True, check=True
     )
     assert done.stdout == "2 [(0, 50), (50, 100)]\n", done.stderr
+
+
+def test_values_of_a_few_states_come_from_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As at time limits: torch's linear layers would wake its threads while a flow is sampled."""
+    kwargs = {"share_features_extractor": False, "net_arch": [8, 8]}
+    policy = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=kwargs).policy
+    states = th.randn(5, 3)
+    with th.no_grad():
+        expected = ActorCriticPolicy.predict_values(policy, states)
+        monkeypatch.delattr(th.nn.Linear, "forward")
+        th.testing.assert_close(policy.predict_values(states), expected)
