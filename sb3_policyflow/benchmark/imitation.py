@@ -54,10 +54,18 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 }
 """What differs from the YAML files, by algorithm. Values of up to 10 are not clipped by 100."""
 OF_POLICYFLOW: dict[str, dict[str, Any]] = {
-    "good": {"learning_rate": 1e-4, "brownian_coef": 0.02, "imitation_kwargs": {"noise_std": 0.3}},
+    "good": {
+        "learning_rate": "lin_5e-5",
+        "normalize_advantage": False,
+        "brownian_coef": 0.05,
+        "imitation_kwargs": {"noise_std": 0.3},
+    },
     "slow": {"learning_rate": 3e-4, "brownian_coef": 0.05, "imitation_kwargs": {"noise_std": 0.5}},
 }
-"""And by demonstrator. The noise explores, and from good demonstrations there is little to find."""
+"""And by demonstrator. The noise explores, and from good demonstrations there is little to find.
+
+What is nearly optimal has small advantages, which normalization would make large: goals are lost.
+"""
 
 
 def hyperparams(style: str, algo: str, folder: Path) -> dict[str, Any]:
