@@ -57,7 +57,7 @@ def densest_endpoints(
     n, k = features.shape[0], latents.shape[0]
     # Contiguous, as kernels take it: of one observation it would be a view.
     repeated = features.unsqueeze(1).expand(-1, k, -1).flatten(0, 1).contiguous()
-    endpoints = transport(latents.repeat(n, 1), repeated).reshape(n, k, -1)
+    endpoints = transport(latents.repeat(n, 1), repeated).reshape(n, k, latents.shape[1])
     chosen = densest(endpoints)
     rows = th.arange(n, device=chosen.device)
     return latents[chosen], endpoints[rows, chosen]
