@@ -11,7 +11,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, IdentityEnvBox, SimpleMultiObsEnv
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch.nn.utils import parameters_to_vector
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
@@ -136,6 +136,9 @@ def test_images(algorithm: type[Any], share: bool) -> None:
 @pytest.mark.slow
 def test_learns_to_copy_its_observation(algorithm: type[Any]) -> None:
     env = make_vec_env(lambda: IdentityEnvBox(eps=0.3), 8)
+    assert isinstance(env, DummyVecEnv)
+    for i, single in enumerate(env.envs):  # observations are samples of this space
+        single.unwrapped.observation_space.seed(i)
     options = {"n_steps": 64, "batch_size": 128, "learning_rate": 2e-3, "gamma": 0.4, "seed": 0}
     model = algorithm("MlpFlowPolicy", env, **options)
     untrained, _ = evaluate_policy(model, env, 8)
