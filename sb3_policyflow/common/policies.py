@@ -1,6 +1,5 @@
 """What the policies of all flow algorithms share: networks, values, and how an action is made."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -29,8 +28,8 @@ from sb3_policyflow.common.options import accepts_former_names
 from sb3_policyflow.common.update import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
-from sb3_policyflow.kernels import KernelCritic, has_values, make_velocity_field
-from sb3_policyflow.resilience.finite import NotFiniteError
+from sb3_policyflow.kernels import KernelCritic, are_in_mode, has_values, make_velocity_field
+from sb3_policyflow.resilience.finite import check_actions
 
 NetArch = list[int] | dict[str, list[int]]
 LatentsAndEnds = tuple[th.Tensor, th.Tensor | None]
@@ -225,12 +224,8 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """Put the policy in training or evaluation mode; see SB3, which does so in each predict."""
-        modules: list[Any] = [self]
-        for module in modules:  # grows; much faster than Module.modules()
-            if module.training is not mode:
-                super().set_training_mode(mode)
-                return
-            modules += [part for part in module._modules.values() if part is not None]
+        if not are_in_mode(self, mode):
+            super().set_training_mode(mode)
 
     def values(self, features: th.Tensor) -> th.Tensor:
         """Estimated values of states with these features, shape (n, 1)."""
@@ -240,11 +235,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         return values
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:
-        """Estimated values of states, shape (n, 1), by kernels as in :meth:`forward`.
-
-        The few states of a rollout that need them then wake no threads of torch, which would keep
-        the cores from the kernels that sample.
-        """
+        """Estimated values of states, shape (n, 1), by kernels, which wake no threads of torch."""
         extract = super(ActorCriticPolicy, self).extract_features  # as SB3 does
         return self.values(extract(obs, self.vf_features_extractor))
 
@@ -263,6 +254,13 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
             return scale * th.randn(size, device=features.device, dtype=features.dtype), None
         candidates = scale * candidate_latents(self.action_dim).to(features)
         return densest_endpoints(self.transport, candidates, features)
+
+    def draw_endpoints(
+        self, features: th.Tensor, deterministic: bool
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Latents, see :meth:`draw_latents`, and their end points, each (n, action_dim)."""
+        latents, found = self.draw_latents(features, deterministic)
+        return latents, self.transport(latents, features) if found is None else found
 
     @property
     @abstractmethod
@@ -307,18 +305,10 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         return self._finished(actions)
 
     def _finished(self, actions: th.Tensor) -> th.Tensor:
-        """Actions in the shape of their space, (n, ...).
-
-        :raises NotFiniteError: If one is not finite, as SB3's PPO does before anything acts on it.
-        """
+        """Actions in the shape of their space, (n, ...), all of them finite."""
         assert self.action_space.shape is not None
-        # The sum of finite numbers is finite but for overflow, and takes half the time.
-        if has_values() and not math.isfinite(actions.sum()) and not actions.isfinite().all():
-            row = int((~actions.isfinite()).any(dim=-1).nonzero()[0])
-            raise NotFiniteError(
-                f"The policy's action is not finite, for observation {row} of the batch: look for "
-                "such numbers in observation and parameters, or load an earlier checkpoint."
-            )
+        if has_values():
+            check_actions(actions)
         return actions.reshape(-1, *self.action_space.shape)
 
     def keep_within_bounds(self) -> None:

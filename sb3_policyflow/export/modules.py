@@ -109,10 +109,10 @@ class ActionModule(nn.Module):
         :return: Actions within their bounds, shape (n, ...).
         """
         features = self.policy.actor_features(self._normalized(observations))
-        found = None
         if latents is None:
-            latents, found = self.policy.draw_latents(features, deterministic=True)
-        actions = self.policy.transport(latents, features) if found is None else found
+            _, actions = self.policy.draw_endpoints(features, deterministic=True)
+        else:
+            actions = self.policy.transport(latents, features)
         actions = actions.reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             actions = self.low + 0.5 * (actions + 1.0) * (self.high - self.low)

@@ -89,8 +89,7 @@ class FPOPolicy(FlowPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, NoRecord]:
         """Draw actions; deterministic ones have no noise (FPO++: with "zero", zero-sampling)."""
-        latents, found = self.draw_latents(features, deterministic)
-        actions = self.transport(latents, features) if found is None else found
+        _, actions = self.draw_endpoints(features, deterministic)
         if self.action_noise_std > 0 and not deterministic:
             actions = actions + self.action_noise_std * th.randn_like(actions)
         return actions, NoRecord()

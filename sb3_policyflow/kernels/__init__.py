@@ -11,7 +11,7 @@ from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels.critic import KernelCritic
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.gradients import clip_gradients_in_place, step_in_place
-from sb3_policyflow.kernels.inspection import has_values
+from sb3_policyflow.kernels.inspection import are_in_mode, has_values
 from sb3_policyflow.kernels.layouts import LossOptions
 from sb3_policyflow.kernels.losses import KernelLoss, LossInputs
 from sb3_policyflow.kernels.policies import reason_kernels_are_off, shares_cores
@@ -21,6 +21,7 @@ __all__ = [
     "KernelLoss",
     "LossInputs",
     "LossOptions",
+    "are_in_mode",
     "clip_gradients_in_place",
     "has_values",
     "make_velocity_field",

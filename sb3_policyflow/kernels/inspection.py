@@ -210,6 +210,20 @@ def _is_watched() -> bool:
     return any(type(th._C._get_function_stack_at(i)) is not DeviceContext for i in modes)
 
 
+def are_in_mode(module: nn.Module, training: bool) -> bool:
+    """Whether a module and all its parts are in training mode, or all in evaluation mode.
+
+    :param module: The module.
+    :param training: The mode that is asked for.
+    """
+    modules = [module]
+    for part in modules:  # grows; much faster than Module.modules()
+        if part.training is not training:
+            return False
+        modules += [child for child in part._modules.values() if child is not None]
+    return True
+
+
 def has_values() -> bool:
     """Whether tensors have values: not while compiling, exporting or tracing, nor in torch.func."""
     is_traced = th.compiler.is_compiling() or th._C._get_tracing_state() is not None

@@ -177,8 +177,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self, features: th.Tensor, deterministic: bool = False
     ) -> tuple[th.Tensor, PolicyFlowRecord]:
         """Draw actions (paper, algorithm 1, lines 6 to 8); deterministic ones have no noise n."""
-        latents, found = self.draw_latents(features, deterministic)
-        endpoints = self.transport(latents, features) if found is None else found
+        latents, endpoints = self.draw_endpoints(features, deterministic)
         record = PolicyFlowRecord(latents, endpoints)
         if deterministic:
             return endpoints, record

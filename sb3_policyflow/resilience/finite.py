@@ -55,6 +55,20 @@ def all_finite(values: th.Tensor) -> bool:
     return math.isfinite(values.sum()) or bool(values.isfinite().all())
 
 
+def check_actions(actions: th.Tensor) -> None:
+    """Stop at an action that is not finite, as SB3's PPO does before anything acts on it.
+
+    :param actions: Shape (n, dim).
+    :raises NotFiniteError: With the first observation concerned.
+    """
+    if not all_finite(actions):
+        row = int((~actions.isfinite()).any(dim=-1).nonzero()[0])
+        raise NotFiniteError(
+            f"The policy's action is not finite, for observation {row} of the batch: look for "
+            "such numbers in observation and parameters, or load an earlier checkpoint."
+        )
+
+
 def check_rollout(buffer: RolloutBuffer, first_timestep: int) -> None:
     """Stop at actions, values or advantages of a complete rollout that are not finite.
 
