@@ -13,10 +13,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.checks import at_least
 from sb3_policyflow.common.entropy import action_entropy
 from sb3_policyflow.common.losses import gaussian_kl, shifted_gaussian_log_ratio
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
 from sb3_policyflow.common.tree import rows
 from sb3_policyflow.flows import TIME_SAMPLERS

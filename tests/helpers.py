@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.resilience.saving import RandomStates
 
 SMALL: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1, "seed": 0}

@@ -11,6 +11,7 @@ from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -231,8 +232,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
         self._update_learning_rate(self.policy.optimizer)
-        rollout = self.rollout_buffer.samples()
-        rollout = rollout._replace(advantages=self._normalized(rollout.advantages, "rollout"))
+        rollout = self._rollout()
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
         parameters = list(self.policy.parameters())
@@ -242,10 +242,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             kls = [] if rule.window == "epoch" else kls
             samples = rollout._replace(drawn=update.draw())  # lines 15 to 17
             self.policy.set_training_mode(True)
-            for batch in self.rollout_buffer.minibatches(samples, update.batch_size):  # line 14
-                advantages = self._normalized(batch.advantages, "minibatch")
-                # Lines 18 to 21: ratio, surrogate objective, regularizers, error of the values
-                loss, kl = update.loss(batch._replace(advantages=advantages), metrics)
+            minibatches = self._minibatches(samples, update.batch_size)
+            # Line 14, and 18 to 21: ratio, surrogate objective, regularizers, error of the values
+            for loss, kl in update.minibatch_losses(minibatches, metrics):
                 kls.append(kl)
                 stop = self.target_kl is not None and self.ranks.mean(kl) > 1.5 * self.target_kl
                 if not stop:
@@ -262,10 +261,19 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
                 adapt_learning_rate(self, rule, kls, update.trains_actor)
         self._log_update(loss, th.stack(kls).mean(), metrics)
 
-    def _normalized(self, advantages: th.Tensor, scope: str) -> th.Tensor:
-        """Advantages, shape (n,), normalized if this is the scope in which that is done."""
-        is_due = self.normalize_advantage and self.advantage_scope == scope
-        return self.ranks.normalized(advantages) if is_due else advantages
+    def _rollout(self) -> FlowRolloutBufferSamples:
+        """The rollout in the buffer."""
+        rollout = self.rollout_buffer.samples()
+        if self.normalize_advantage and self.advantage_scope == "rollout":
+            return rollout._replace(advantages=self.ranks.normalized(rollout.advantages))
+        return rollout
+
+    def _minibatches(self, samples: FlowRolloutBufferSamples, size: int) -> Minibatches:
+        """The minibatches of an epoch."""
+        minibatches = self.rollout_buffer.minibatches(samples, size)
+        if self.normalize_advantage and self.advantage_scope == "minibatch":
+            minibatches.map_advantages(self.ranks.normalized)
+        return minibatches
 
     def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
         """Take one step of the optimizer.

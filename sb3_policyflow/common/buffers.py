@@ -1,34 +1,14 @@
 """Rollout buffers that also store how each action was made."""
 
-from collections.abc import Generator, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Generator
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.common.tree import are_small, rows, tensors
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
 from sb3_policyflow.resilience.collection import PendingBonus
-
-SHUFFLED_AT_ONCE = 2**26
-"""Bytes of a rollout of small rows up to which a shuffled copy of it is made for each epoch."""
-
-
-class FlowRolloutBufferSamples(NamedTuple):
-    """Transitions with the record of how each action was made; n samples along the first axis.
-
-    ``record`` is what the policy's ``forward`` returned, a NamedTuple of tensors (n, ...).
-    ``drawn`` is what an update draws anew in each epoch, a NamedTuple of tensors (n, ...) too.
-    """
-
-    observations: PyTorchObs
-    actions: th.Tensor
-    old_values: th.Tensor
-    advantages: th.Tensor
-    returns: th.Tensor
-    record: Any
-    drawn: Any = ()
 
 
 class RecordBufferMixin(RolloutBuffer):
@@ -117,7 +97,7 @@ class RecordBufferMixin(RolloutBuffer):
 
     def minibatches(
         self, samples: FlowRolloutBufferSamples, batch_size: int | None = None
-    ) -> Iterator[FlowRolloutBufferSamples]:
+    ) -> Minibatches:
         """Go through ``samples`` once, in random order.
 
         The order is the one in which SB3's buffer gives back its transitions.
@@ -128,18 +108,9 @@ class RecordBufferMixin(RolloutBuffer):
         n_samples = self.buffer_size * self.n_envs
         order = np.random.permutation(n_samples)
         # SB3 numbers transitions environment by environment, ``samples`` step by step.
-        indices = th.as_tensor(
-            order % self.buffer_size * self.n_envs + order // self.buffer_size, device=self.device
-        )
-        size = batch_size or n_samples
-        parts = [slice(start, start + size) for start in range(0, n_samples, size)]
-        n_bytes = sum(tensor.nbytes for tensor in tensors(samples))
-        if n_bytes <= SHUFFLED_AT_ONCE and are_small(samples):
-            # Many views of one shuffled copy are faster than many gathers of few small rows.
-            shuffled = rows(samples, indices)
-            yield from (rows(shuffled, part) for part in parts)
-        else:
-            yield from (rows(samples, indices[part]) for part in parts)
+        indices = order % self.buffer_size * self.n_envs + order // self.buffer_size
+        ordered = th.as_tensor(indices, device=self.device)
+        return Minibatches(samples, ordered, batch_size or n_samples)
 
     def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         """Go through the rollout once in minibatches, in random order."""

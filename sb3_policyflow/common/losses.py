@@ -8,7 +8,7 @@ from typing import Any
 import torch as th
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.flows import MatchingSamples
 
 SMALLEST_CLIP_RANGE = 1e-6

@@ -2,14 +2,14 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
-from sb3_policyflow.kernels import clip_gradients_in_place, step_in_place
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
+from sb3_policyflow.kernels import clip_gradients_in_place, learns_features, step_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -48,8 +48,12 @@ class CompiledTerms(NamedTuple):
     maxima: dict[str, float]
 
 
-CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], CompiledTerms | None]
-"""Takes a minibatch, and the features of actor and critic; None where kernels cannot work."""
+CompiledLoss = Callable[
+    [FlowRolloutBufferSamples, th.Tensor, th.Tensor], Callable[[slice], CompiledTerms] | None
+]
+"""Takes samples, and the features of actor and critic, and gives what evaluates some of them.
+
+None where kernels cannot work."""
 
 
 class FlowUpdate(ABC):
@@ -97,6 +101,40 @@ class FlowUpdate(ABC):
         :param features: The actor's features, shape (n, features_dim).
         """
 
+    def minibatch_losses(
+        self, minibatches: Minibatches, metrics: "UpdateMetrics"
+    ) -> Iterator[tuple[Loss, th.Tensor]]:
+        """Go through the minibatches of an epoch, see :meth:`loss`.
+
+        :param minibatches: Minibatches, with what was drawn for them.
+        :param metrics: Takes what is to be logged.
+        """
+        samples, evaluate = minibatches.shuffled, None
+        if samples is not None and not learns_features(self.policy):
+            # What no step of the optimizer changes, is prepared for all minibatches at once.
+            features = self.policy.actor_critic_features(samples.observations)
+            if not any(values.requires_grad for values in features):
+                evaluate = self._compiled(samples, *features)
+        if evaluate is None:
+            yield from (self.loss(batch, metrics) for batch in minibatches)
+            return
+        for part in minibatches.parts:
+            yield self._logged(evaluate(part), metrics)
+
+    def _compiled(
+        self, samples: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+    ) -> Callable[[slice], CompiledTerms] | None:
+        """What takes the place of the formulas, if anything can."""
+        if self.compiled_loss is None or self.pull is not None:
+            return None
+        return self.compiled_loss(samples, features, critic_features)
+
+    @staticmethod
+    def _logged(compiled: CompiledTerms, metrics: "UpdateMetrics") -> tuple[Loss, th.Tensor]:
+        metrics.add_means(compiled.means)
+        metrics.add_maxima(compiled.maxima)
+        return compiled.loss, compiled.kl
+
     def loss(
         self, batch: FlowRolloutBufferSamples, metrics: "UpdateMetrics"
     ) -> tuple[Loss, th.Tensor]:
@@ -107,12 +145,9 @@ class FlowUpdate(ABC):
         :return: The loss, and the divergence from the reference policy, without dimensions.
         """
         features, critic_features = self.policy.actor_critic_features(batch.observations)
-        if self.compiled_loss is not None and self.pull is None:
-            compiled = self.compiled_loss(batch, features, critic_features)
-            if compiled is not None:
-                metrics.add_means(compiled.means)
-                metrics.add_maxima(compiled.maxima)
-                return compiled.loss, compiled.kl
+        evaluate = self._compiled(batch, features, critic_features)
+        if evaluate is not None:
+            return self._logged(evaluate(slice(None)), metrics)
         terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
         if self.pull is not None:
             pull = self.pull.loss(batch, features)

@@ -125,12 +125,13 @@ class ProcessGroup(Ranks):
 
     def mean_std(self, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         # Chan's formula for the moments of a union, from those of its parts
-        mean = values.mean()
-        parts = self._table(th.stack([mean, (values - mean).square().sum()]))
+        n_values, mean = values.shape[-1], values.mean(-1, keepdim=True)
+        moments = th.stack([mean, (values - mean).square().sum(-1, keepdim=True)])
+        parts = self._table(moments.flatten()).view(self.size, *moments.shape)
         means, squares = parts[:, 0], parts[:, 1]
-        mean = means.mean()
-        total = squares.sum() + len(values) * (means - mean).square().sum()
-        return mean, (total / (self.size * len(values) - 1)).sqrt()
+        mean = means.mean(0)
+        total = squares.sum(0) + n_values * (means - mean).square().sum(0)
+        return mean, (total / (self.size * n_values - 1)).sqrt()
 
     def average_gradients(self, parameters: Iterable[th.nn.Parameter], loss: float) -> float:
         gradients = [p.grad for p in parameters if p.grad is not None]

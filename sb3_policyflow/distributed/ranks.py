@@ -48,9 +48,9 @@ class Ranks(ABC):
     def normalized(self, values: th.Tensor) -> th.Tensor:
         """Values with mean 0 and standard deviation 1 over all ranks; a single one as it is.
 
-        :param values: This rank's, shape (n,).
+        :param values: This rank's, shape (..., n), normalized along the last dimension.
         """
-        if self.size * len(values) < 2:
+        if self.size * values.shape[-1] < 2:
             return values
         mean, std = self.mean_std(values)
         return (values - mean) / (std + 1e-8)
@@ -63,7 +63,8 @@ class Ranks(ABC):
     def mean_std(self, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Mean and standard deviation, as ``Tensor.std`` has it, of all ranks' values together.
 
-        :param values: This rank's, shape (n,) with the same n on each.
+        :param values: This rank's, shape (..., n), the same on each.
+        :return: Two tensors of shape (..., 1).
         """
 
     @abstractmethod
@@ -91,7 +92,7 @@ class Alone(Ranks):
         return value.item()
 
     def mean_std(self, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        return values.mean(), values.std()
+        return values.mean(-1, keepdim=True), values.std(-1, keepdim=True)
 
     def average_gradients(
         self,

@@ -11,8 +11,8 @@ from typing_extensions import Unpack
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.entropy import EntropyBonus
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms

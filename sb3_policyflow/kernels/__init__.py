@@ -13,10 +13,15 @@ from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.gradients import clip_gradients_in_place, step_in_place
 from sb3_policyflow.kernels.inspection import are_in_mode, has_values
 from sb3_policyflow.kernels.layouts import LossOptions
-from sb3_policyflow.kernels.losses import KernelLoss, LossInputs
-from sb3_policyflow.kernels.policies import reason_kernels_are_off, shares_cores
+from sb3_policyflow.kernels.losses import EvaluatedLoss, KernelLoss, LossInputs
+from sb3_policyflow.kernels.policies import (
+    learns_features,
+    reason_kernels_are_off,
+    shares_cores,
+)
 
 __all__ = [
+    "EvaluatedLoss",
     "KernelCritic",
     "KernelLoss",
     "LossInputs",
@@ -24,6 +29,7 @@ __all__ = [
     "are_in_mode",
     "clip_gradients_in_place",
     "has_values",
+    "learns_features",
     "make_velocity_field",
     "reason_kernels_are_off",
     "shares_cores",

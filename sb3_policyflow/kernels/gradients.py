@@ -2,7 +2,9 @@
 
 import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -11,7 +13,7 @@ from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimize
 
 from sb3_policyflow.kernels.compiler import load_kernels
 from sb3_policyflow.kernels.inspection import addresses, are_usable, why_torch_must_work
-from sb3_policyflow.kernels.layouts import AdamOptions, Kernels
+from sb3_policyflow.kernels.layouts import AdamOptions, Integers
 
 PLAIN_ADAM = {"amsgrad": False, "maximize": False, "capturable": False, "differentiable": False}
 """Options of torch's Adam that the kernel knows by their defaults only."""
@@ -31,11 +33,44 @@ def clip_gradients_in_place(grads: Sequence[th.Tensor], max_norm: float) -> floa
     return float(kernels.clip(addresses(grads), sizes, max_norm))
 
 
-class _AdamReading(NamedTuple):
-    """Tensors of a group that a kernel can work on, and where they were when that was checked."""
+@dataclass(frozen=True)
+class _AdamReading:
+    """The tensors that a step takes of a group, and where they were when they were checked.
+
+    ``tensors`` are the gradients of its n parameters, these, both moments and the steps.
+    """
 
     tensors: list[th.Tensor]
     places: list[int]
+
+    @property
+    def n_parameters(self) -> int:
+        """How many parameters have a gradient."""
+        return len(self.tensors) // 5
+
+    def is_same(self, other: "_AdamReading", start: int = 0) -> bool:
+        """Whether another reading, from a tensor on, is of these tensors in the same memory."""
+        tensors = self.tensors[start:], other.tensors[start:]
+        return self.places[start:] == other.places[start:] and all(map(operator.is_, *tensors))
+
+    def is_usable(self, known: "_AdamReading | None") -> bool:
+        """Whether kernels can work on the tensors.
+
+        :param known: A reading on which they can. Autograd makes new gradients for each step.
+        """
+        only_gradients = known is not None and self.is_same(known, self.n_parameters)
+        return are_usable(self.tensors[: self.n_parameters] if only_gradients else self.tensors)
+
+    @cached_property
+    def addresses(self) -> Integers:
+        """Where they are, shape (5, n)."""
+        return np.array(self.places, dtype=np.int64).reshape(5, -1)
+
+    @cached_property
+    def sizes(self) -> Integers:
+        """How many numbers each of the n parameters has."""
+        gradients = self.tensors[: self.n_parameters]
+        return np.array([gradient.numel() for gradient in gradients], dtype=np.int64)
 
 
 _readings: WeakKeyDictionary[th.optim.Optimizer, list[_AdamReading]] = WeakKeyDictionary()
@@ -55,25 +90,17 @@ def step_in_place(optimizer: th.optim.Optimizer) -> bool:
     if len(groups) < len(found):
         return False
     readings = [_AdamReading(tensors, [t.data_ptr() for t in tensors]) for tensors in groups]
-    if not _are_known(optimizer, readings):
-        if not all(are_usable(reading.tensors) for reading in readings):
+    known = dict(enumerate(_readings.get(optimizer, ())))
+    for i, new in enumerate(readings):
+        old = known.get(i)
+        if old is not None and new.is_same(old):
+            readings[i] = old
+        elif not new.is_usable(old):
             return False
-        _readings[optimizer] = readings
+    _readings[optimizer] = readings
     for group, reading in zip(optimizer.param_groups, readings, strict=True):
-        gradients = [p.grad for p in group["params"] if p.grad is not None]
-        if not are_usable(gradients):
-            return False
-        _take_step(kernels, group, gradients, reading.places)
+        kernels.adam(reading.addresses, reading.sizes, _adam_options(group))
     return True
-
-
-def _are_known(optimizer: th.optim.Optimizer, readings: list[_AdamReading]) -> bool:
-    """Whether all tensors, and their memory, are those that were checked before."""
-    known = _readings.get(optimizer, [])
-    return len(known) == len(readings) and all(
-        old.places == new.places and all(map(operator.is_, old.tensors, new.tensors))
-        for old, new in zip(known, readings, strict=True)
-    )
 
 
 def _has_more_to_do(optimizer: Any) -> bool:
@@ -90,7 +117,7 @@ def _has_more_to_do(optimizer: Any) -> bool:
 
 
 def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[th.Tensor] | None:
-    """Parameters with gradients, both moments and steps of a group; None if there are none yet."""
+    """Gradients, their parameters, both moments and steps of a group; None if it has no state."""
     numbers = (group["lr"], *group["betas"])
     has_numbers = all(isinstance(number, float | int) for number in numbers)
     if not has_numbers or any(group[name] != value for name, value in PLAIN_ADAM.items()):
@@ -100,14 +127,13 @@ def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[th.Tensor] | No
     if not all(states):
         return None
     kinds = ("exp_avg", "exp_avg_sq", "step")
-    return [*parameters, *(state[kind] for kind in kinds for state in states)]
+    moments = (state[kind] for kind in kinds for state in states)
+    return [*(p.grad for p in parameters), *parameters, *moments]
 
 
-def _take_step(
-    kernels: Kernels, group: dict[str, Any], gradients: list[th.Tensor], places: list[int]
-) -> None:
+def _adam_options(group: dict[str, Any]) -> AdamOptions:
     beta1, beta2 = group["betas"]
-    options = AdamOptions(
+    return AdamOptions(
         float(group["lr"]),
         float(beta1),
         float(beta2),
@@ -115,6 +141,3 @@ def _take_step(
         float(group["weight_decay"]),
         bool(group.get("decoupled_weight_decay", False)),
     )
-    table = np.array([*(grad.data_ptr() for grad in gradients), *places])
-    sizes = np.array([grad.numel() for grad in gradients])
-    kernels.adam(table.reshape(5, -1), sizes, options)

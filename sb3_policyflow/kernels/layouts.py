@@ -139,9 +139,8 @@ class LossTargets(NamedTuple):
     """What a minibatch of m samples is to be like, for the losses of actor and critic.
 
     Of PolicyFlow's actor, with k rows for each sample: ``actions`` and ``endpoints`` (m, dim),
-    ``advantages`` (m,), ``reference_velocity`` (m k, dim), ``scores`` (n_entries, 3), the
-    interpolant's score coefficients at each distinct time, ``latent_std``, ``log_std`` and
-    ``old_log_std`` (dim,).
+    ``advantages`` (m,), ``reference_velocity`` (m k, dim), ``scores`` (m k, 3), the interpolant's
+    score coefficients, ``latent_std``, ``log_std`` and ``old_log_std`` (dim,).
     Of the critic: ``old_values`` and ``returns`` (m,).
     """
 

@@ -1,7 +1,7 @@
 """The losses of PolicyFlow's actor and of the critic, evaluated and differentiated by kernels."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,27 +34,25 @@ UNIT_ENTROPY = 0.5 * math.log(2 * math.pi * math.e)
 
 
 class LossInputs(NamedTuple):
-    """A minibatch of m samples, with k times for each.
+    """n samples, with k times for each.
 
-    ``features`` and ``critic_features`` (m, ...) and ``log_std`` (dim,) may have gradients.
-    ``times`` (m, k), ``points`` and ``reference_velocity`` (m, k, dim), ``actions`` and
-    ``endpoints`` (m, dim), ``advantages``, ``old_values`` and ``returns`` (m,), ``old_log_std``
-    and ``latent_std`` (dim,) have none.
+    ``features`` and ``critic_features`` (n, ...) may have gradients. ``times`` (n, k), ``points``
+    and ``reference_velocity`` (n, k, dim), ``scores`` (n, k, 3), the interpolant's score
+    coefficients at the times, ``actions`` and ``endpoints`` (n, dim), ``advantages``,
+    ``old_values`` and ``returns`` (n,) have none.
     """
 
     features: th.Tensor
     critic_features: th.Tensor
-    log_std: th.Tensor
     times: th.Tensor
     points: th.Tensor
     reference_velocity: th.Tensor
+    scores: th.Tensor
     actions: th.Tensor
     endpoints: th.Tensor
     advantages: th.Tensor
     old_values: th.Tensor
     returns: th.Tensor
-    old_log_std: th.Tensor
-    latent_std: th.Tensor
 
 
 class LossTerms(NamedTuple):
@@ -72,41 +70,90 @@ class LossTerms(NamedTuple):
 
 
 class KernelLoss:
-    """Evaluates and differentiates the losses of PolicyFlow's actor and of the critic.
+    """The losses of PolicyFlow's actor and of the critic, with their gradients.
 
     The loss is policy_gradient_loss + brownian_coef * brownian_loss - ent_coef * entropy
     + vf_coef * value_loss.
 
     :param options: Options of the losses.
-    :param scores: The interpolant's score coefficients at times (n,), each of shape (n,).
+    :param old_log_std: Of the reference policy's noise, shape (dim,).
+    :param latent_std: Standard deviations of the latents, shape (dim,).
     """
 
-    def __init__(
-        self, options: LossOptions, scores: Callable[[th.Tensor], tuple[th.Tensor, ...]]
-    ) -> None:
+    def __init__(self, options: LossOptions, old_log_std: th.Tensor, latent_std: th.Tensor) -> None:
         self.options = options
-        self.scores = scores
+        self.old_log_std: Floats = old_log_std.numpy()
+        self.latent_std: Floats = latent_std.numpy()
         self._critic = KernelView(read_critic)
 
-    def __call__(self, policy: Any, inputs: LossInputs) -> "EvaluatedLoss | None":
-        """The loss of a minibatch.
+    def prepare(self, policy: Any, inputs: LossInputs) -> "PreparedLoss | None":
+        """Everything but the evaluation, for samples that are evaluated a few at a time.
 
-        :param policy: A policy with a velocity field of kernels and SB3's critic.
-        :param inputs: The minibatch.
+        :param policy: A policy with a velocity field of kernels, a ``noise_log_std`` and SB3's
+            critic. Until the last evaluation its weights may change, but not its modules.
+        :param inputs: The samples.
         :return: None where kernels cannot work.
         """
         field, critic = policy.velocity, self._critic.of(policy)
         actor = field.parts() if type(field) is KernelVelocityField else "not a field of kernels"
         if isinstance(actor, str) or isinstance(critic, str):
             return None
-        parameters = [inputs.log_std, *actor.parameters, *critic.tensors]
+        log_std = policy.noise_log_std
+        parameters = [log_std, *actor.parameters, *critic.tensors]
         if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters):
             note_fallback("parameters have hooks")
             return None
-        if not are_usable(inputs) or not actor.supports(inputs.points, inputs.features):
-            note_fallback("a minibatch is not contiguous float32 on the CPU")
+        is_known = actor.supports(inputs.points, inputs.features)
+        if not is_known or not are_usable((log_std, *inputs)):
+            note_fallback("samples are not contiguous float32 on the CPU")
             return None
-        return EvaluatedLoss(self, actor, critic, inputs)
+        return PreparedLoss(self, policy, actor, critic, inputs)
+
+
+class PreparedLoss:
+    """The losses of some samples, of which any part can be evaluated.
+
+    :param loss: The losses.
+    :param policy: The policy.
+    :param actor: Its velocity field.
+    :param critic: Its critic.
+    :param inputs: The samples.
+    """
+
+    def __init__(
+        self, loss: KernelLoss, policy: Any, actor: FieldParts, critic: MLP, inputs: LossInputs
+    ) -> None:
+        self.loss, self.actor, self.critic = loss, actor, critic
+        self._policy, self._inputs = policy, inputs
+        self._arrays: Any = LossInputs._make(tensor.detach().numpy() for tensor in inputs)
+        # The gradients of all parameters are one tensor: those of the actor, log_std and critic.
+        tensors = [*actor.parameters, policy.noise_log_std, *critic.tensors]
+        size = sum(tensor.numel() for tensor in tensors)
+        self._flat = th.empty(size, dtype=th.float32, device="cpu")
+        self._gradients = views_like(tensors, self._flat)
+
+    def evaluate(self, rows: slice) -> "EvaluatedLoss":
+        """The loss of some of the samples.
+
+        :param rows: Which, with a step of 1.
+        """
+        arrays: Any = LossInputs._make(array[rows] for array in self._arrays)
+        features, critic_features = (
+            values[rows] if values.requires_grad else values for values in self._inputs[:2]
+        )
+        log_std = self._policy.noise_log_std
+        return EvaluatedLoss(self, arrays, log_std, (features, critic_features))
+
+    def gradients(self, flat: Floats, adds_up: bool) -> list[th.Tensor]:
+        """The gradients of the parameters, which are valid until those of other samples are.
+
+        :param flat: Their numbers.
+        :param adds_up: Whether parameters have gradients, which may be those of other samples.
+        """
+        if adds_up:
+            return views_like(self._gradients, th.from_numpy(flat))
+        self._flat.numpy()[:] = flat
+        return self._gradients
 
 
 class EvaluatedLoss:
@@ -115,49 +162,50 @@ class EvaluatedLoss:
     It can be used in place of the tensor that autograd would go back from: ``item`` and
     ``backward`` are a tensor's.
 
-    :param loss: The loss.
-    :param actor: The velocity field.
-    :param critic: The critic.
-    :param inputs: The minibatch.
+    :param prepared: What it is evaluated by.
+    :param arrays: The samples.
+    :param log_std: Of the noise, which may have a gradient.
+    :param features: Those of actor and critic, of these samples where they have gradients.
     """
 
     def __init__(
-        self, loss: KernelLoss, actor: FieldParts, critic: MLP, inputs: LossInputs
+        self,
+        prepared: PreparedLoss,
+        arrays: Any,
+        log_std: th.Tensor,
+        features: tuple[th.Tensor, th.Tensor],
     ) -> None:
-        self._options, self._actor, self._critic = loss.options, actor, critic
-        self._inputs = inputs
-        self._n_samples, self._n_times = inputs.times.shape
-        arrays: Any = LossInputs._make(tensor.detach().numpy() for tensor in inputs)
+        actor, loss = prepared.actor, prepared.loss
+        self._prepared, self._options = prepared, loss.options
+        self._log_std, self._features = log_std, features
+        self._n_samples, self._n_times = shape = arrays.times.shape
         self._embedding = Embedding(actor, arrays.times)
-        points = arrays.points.reshape(-1, actor.dim)
-        shape = inputs.times.shape
-        self._first = self._embedding.kernel_input(points, arrays.features, shape, shape)
-        self._critic_first = mlp_input(critic, inputs.critic_features)
+        points, reference = arrays.points, arrays.reference_velocity
+        self._first = self._embedding.kernel_input(
+            points.reshape(-1, actor.dim), arrays.features, shape, shape
+        )
+        self._critic_first = mlp_input(prepared.critic, arrays.critic_features)
         self._targets = LossTargets(
             arrays.actions,
             arrays.endpoints,
             arrays.advantages,
-            arrays.reference_velocity.reshape(-1, actor.dim),
-            th.stack(loss.scores(th.from_numpy(self._embedding.times)), dim=1).numpy(),
-            arrays.latent_std,
-            arrays.log_std,
-            arrays.old_log_std,
+            reference.reshape(-1, actor.dim),
+            arrays.scores.reshape(-1, 3),
+            loss.latent_std,
+            log_std.detach().numpy(),
+            loss.old_log_std,
             arrays.old_values,
             arrays.returns,
         )
         self._grad_features, self._grad_critic_features = (
-            th.empty_like(features if features.requires_grad else features[:0])
-            for features in inputs[:2]
+            th.empty_like(values if values.requires_grad else values[:0]) for values in features
         )
         self._compute()
-        self.terms = self._terms(arrays.log_std)
+        self.terms = self._terms()
 
     def _compute(self) -> None:
-        """Compute gradients and sums, on all threads.
-
-        The gradients of all parameters are one tensor: those of the actor, log_std and critic.
-        """
-        actor, critic = self._actor, self._critic
+        """Compute gradients and sums, on all threads."""
+        actor, critic = self._prepared.actor, self._prepared.critic
         first, critic_first = self._first, self._critic_first
         n_first = first.weights.size + first.table.size
         begin, end = actor.n_embedding, actor.n_parameters + actor.dim
@@ -165,8 +213,8 @@ class EvaluatedLoss:
         flops = 3 * (self._n_times * actor.network.flops_per_row + critic.flops_per_row)
         parts = n_parts(self._n_samples, flops)
         firsts = np.zeros((parts, n_first + n_critic_first), dtype=np.float32)
-        total = th.zeros(parts, end + critic.n_parameters, dtype=th.float32, device="cpu")
-        flat, sums = total.numpy(), np.zeros((parts, N_SUMS))
+        flat = np.zeros((parts, end + critic.n_parameters), dtype=np.float32)
+        sums = np.zeros((parts, N_SUMS))
         features, critic_features = self._grad_features.numpy(), self._grad_critic_features.numpy()
         run, targets, options = critic.kernels.loss_gradients, self._targets, self._options
 
@@ -180,21 +228,22 @@ class EvaluatedLoss:
             run(critic_first, critic.layout, targets, options, False, grads, *rows)
 
         in_parts(self._n_samples, parts, run_part)
-        self._sums, of_first, self._flat = sums[0], firsts[0], total[0]
+        self._sums, of_first, self._flat = sums[0], firsts[0], flat[0]
         if parts > 1:
-            self._sums, of_first, self._flat = sums.sum(axis=0), firsts.sum(axis=0), total.sum(0)
+            self._sums, of_first, self._flat = sums.sum(0), firsts.sum(0), flat.sum(0)
             self._sums[LARGEST] = sums[:, LARGEST].max()
-        flat, shape = self._flat.numpy(), critic_first.weights.shape
-        self._embedding.backward(of_first[:n_first], flat[:begin])
-        flat[end - actor.dim : end] -= options.ent_coef
+        shape = critic_first.weights.shape
+        self._embedding.backward(of_first[:n_first], self._flat[:begin])
+        self._flat[end - actor.dim : end] -= options.ent_coef
         weight_end = n_first + critic_first.weights.size
         of_weight, of_bias = of_first[n_first:weight_end].reshape(shape), of_first[weight_end:]
-        of_critic = flat[end : end + n_critic_first]
+        of_critic = self._flat[end : end + n_critic_first]
         of_critic[: of_weight.size].reshape(shape[::-1])[:] = of_weight.T
         of_critic[of_weight.size :] = of_bias
 
-    def _terms(self, log_std: Floats) -> LossTerms:
+    def _terms(self) -> LossTerms:
         sums, n = self._sums.tolist(), self._n_samples
+        log_std = self._targets.log_std.tolist()
         n_rows = n * self._n_times
         n_surrogates = n if self._options.averages_shift else n_rows
         return LossTerms(
@@ -205,7 +254,7 @@ class EvaluatedLoss:
             kl=sums[KL] / n_surrogates,
             brownian_loss=sums[BROWNIAN] / n_rows,
             velocity_change=sums[CHANGE] / n_rows,
-            entropy=float(log_std.sum()) + len(log_std) * UNIT_ENTROPY,
+            entropy=math.fsum(log_std) + len(log_std) * UNIT_ENTROPY,
             value_loss=sums[VALUE] / n,
         )
 
@@ -223,11 +272,12 @@ class EvaluatedLoss:
 
         :param inputs: The parameters; all if not given.
         """
-        actor, critic = self._actor, self._critic
-        tensors = [*actor.parameters, self._inputs.log_std, *critic.tensors]
-        gradients = [*views_like(tensors, self._flat)]
-        tensors += self._inputs[:2]
-        gradients += [self._grad_features, self._grad_critic_features]
+        actor, critic = self._prepared.actor, self._prepared.critic
+        tensors = [*actor.parameters, self._log_std, *critic.tensors]
+        adds_up = any(tensor.is_leaf and tensor.grad is not None for tensor in tensors)
+        gradients = self._prepared.gradients(self._flat, adds_up)
+        tensors += self._features
+        gradients = [*gradients, self._grad_features, self._grad_critic_features]
         wanted = None if inputs is None else set(inputs)
         roots, root_gradients = list[th.Tensor](), list[th.Tensor]()
         for tensor, gradient in zip(tensors, gradients, strict=True):

@@ -223,16 +223,15 @@ class _MLPEvaluation(th.autograd.Function):
         )
 
 
-def mlp_input(network: MLP, inputs: th.Tensor) -> KernelInput:
+def mlp_input(network: MLP, features: Floats) -> KernelInput:
     """An MLP's first layer as kernels take it: inputs are features, and there are no points."""
     weight, bias = network.held[0].numpy(), network.held[1].numpy()
-    features = inputs.detach().numpy()
     no_points = np.empty((len(features), 0), dtype=np.float32)
     return KernelInput(no_points, features, np.ascontiguousarray(weight.T), bias[None], NO_INDEX)
 
 
 def _evaluation(network: MLP, inputs: th.Tensor) -> Evaluation:
-    return Evaluation(network, mlp_input(network, inputs))
+    return Evaluation(network, mlp_input(network, inputs.detach().numpy()))
 
 
 def differentiable_gradients(

@@ -26,6 +26,14 @@ def reason_kernels_are_off(policy: Any) -> str | None:
     return f"for the critic, {critic}" if isinstance(critic, str) else None
 
 
+def learns_features(policy: Any) -> bool:
+    """Whether the features extractors of a policy have parameters.
+
+    :param policy: A policy of SB3.
+    """
+    return any("features_extractor" in name for name, _ in policy.named_parameters())
+
+
 def shares_cores(train: Callable[[Any], None]) -> Callable[[Any], None]:
     """Give kernels torch's threads while an algorithm trains, if they do most of its work.
 
@@ -42,6 +50,5 @@ def shares_cores(train: Callable[[Any], None]) -> Callable[[Any], None]:
 
 def _cores_for(policy: Any) -> AbstractContextManager[None]:
     """A block in which kernels have torch's threads, unless a features extractor needs them."""
-    parameters = (p for name, p in policy.named_parameters() if "features_extractor" in name)
-    torch_works = next(parameters, None) is not None or reason_kernels_are_off(policy) is not None
+    torch_works = learns_features(policy) or reason_kernels_are_off(policy) is not None
     return nullcontext() if torch_works else kernels_have_the_cores()

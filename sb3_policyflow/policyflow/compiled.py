@@ -1,16 +1,17 @@
 """PolicyFlow's loss in one call of a kernel, in place of its formulas."""
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES, clipped_surrogate
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.update import CompiledLoss, CompiledTerms
 from sb3_policyflow.flows import Interpolant
-from sb3_policyflow.kernels import KernelLoss, LossInputs, LossOptions
+from sb3_policyflow.kernels import EvaluatedLoss, KernelLoss, LossInputs, LossOptions
 
 if TYPE_CHECKING:  # that module imports this one
     from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
@@ -44,44 +45,46 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         vf_coef=update.vf_coef,
         clip_range_vf=unbounded if update.clip_range_vf is None else update.clip_range_vf,
     )
-    return CompiledPolicyFlowLoss(update, KernelLoss(options, interpolant.score_coefficients))
+    return CompiledPolicyFlowLoss(update, options)
 
 
 class CompiledPolicyFlowLoss:
-    """PolicyFlow's loss of a minibatch, by a kernel.
+    """PolicyFlow's loss by a kernel, see :data:`~sb3_policyflow.common.update.CompiledLoss`.
 
     :param update: The update that it is a part of.
-    :param kernel: The kernel, with the options of the update.
+    :param options: The kernel's options.
     """
 
-    def __init__(self, update: "PolicyFlowUpdate", kernel: KernelLoss) -> None:
-        self._policy, self._kernel = update.policy, kernel
-        self._old_log_std = update.reference_log_std
-        self._latent_std = update.latent_std * th.ones_like(update.reference_log_std)
+    def __init__(self, update: "PolicyFlowUpdate", options: LossOptions) -> None:
+        self._policy = update.policy
+        self._scores = update.flow.interpolant.score_coefficients
+        log_std = update.reference_log_std
+        self._kernel = KernelLoss(options, log_std, update.latent_std * th.ones_like(log_std))
 
     def __call__(
-        self, batch: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
-    ) -> CompiledTerms | None:
+        self, samples: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+    ) -> Callable[[slice], CompiledTerms] | None:
         inputs = LossInputs(
             features=features,
             critic_features=critic_features,
-            log_std=self._policy.noise_log_std,
-            times=batch.drawn.times,
-            points=batch.drawn.points,
-            reference_velocity=batch.drawn.reference_velocity,
-            actions=batch.actions,
-            endpoints=batch.record.endpoints,
-            advantages=batch.advantages,
-            old_values=batch.old_values,
-            returns=batch.returns,
-            old_log_std=self._old_log_std,
-            latent_std=self._latent_std,
+            times=samples.drawn.times,
+            points=samples.drawn.points,
+            reference_velocity=samples.drawn.reference_velocity,
+            scores=th.stack(self._scores(samples.drawn.times), dim=-1),
+            actions=samples.actions,
+            endpoints=samples.record.endpoints,
+            advantages=samples.advantages,
+            old_values=samples.old_values,
+            returns=samples.returns,
         )
-        evaluated = self._kernel(self._policy, inputs)
-        if evaluated is None:
-            return None
-        means = evaluated.terms._asdict()
-        kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
-        maxima = {"log_ratio_max": means.pop("log_ratio_max")}
-        means["entropy_loss"] = -means.pop("entropy")
-        return CompiledTerms(evaluated, kl, means, maxima)
+        prepared = self._kernel.prepare(self._policy, inputs)
+        return None if prepared is None else lambda rows: _terms(prepared.evaluate(rows))
+
+
+def _terms(evaluated: EvaluatedLoss) -> CompiledTerms:
+    """A minibatch's loss by its parts."""
+    means = evaluated.terms._asdict()
+    kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
+    maxima = {"log_ratio_max": means.pop("log_ratio_max")}
+    means["entropy_loss"] = -means.pop("entropy")
+    return CompiledTerms(evaluated, kl, means, maxima)

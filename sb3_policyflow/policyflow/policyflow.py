@@ -11,12 +11,12 @@ from typing_extensions import Unpack
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import (
     gaussian_entropy,
     gaussian_kl,
     shifted_gaussian_log_ratio,
 )
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule

@@ -16,7 +16,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.buffers import FlowRolloutBuffer, FlowRolloutBufferSamples
+from sb3_policyflow.common.buffers import FlowRolloutBuffer
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.tree import map_tensors
 from sb3_policyflow.distributed import shared_memory
 from tests.helpers import collect, weights

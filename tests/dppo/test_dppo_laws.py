@@ -11,7 +11,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 from torch.distributions import Normal
 
 from sb3_policyflow import DPPO
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.dppo.dppo import DPPOUpdate
 from sb3_policyflow.dppo.policies import DPPORecord

@@ -6,8 +6,8 @@ import pytest
 import torch as th
 
 from sb3_policyflow import FPO
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import SURROGATES
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.tree import rows
 from sb3_policyflow.fpo.fpo import FPOUpdate, MonteCarloSamples
 from sb3_policyflow.fpo.policies import FPOPolicy

@@ -198,3 +198,48 @@ def test_hooks_of_an_optimizer_see_every_step() -> None:
     model.policy.optimizer.register_step_post_hook(lambda *_: seen.append(1))
     train(model, 32)
     assert len(seen) == 8
+
+
+def test_what_is_prepared_for_an_epoch_is_evaluated_as_each_minibatch() -> None:
+    model, update, samples = prepared(brownian_coef=0.2, log_std_bounds=(-1.0, 0.5))
+    minibatches = model.rollout_buffer.minibatches(samples, 10)
+    metrics = UpdateMetrics()
+    losses = update.minibatch_losses(minibatches, metrics)
+    for batch, (loss, kl) in zip(minibatches, losses, strict=True):
+        model.policy.zero_grad()
+        loss.backward()
+        found = loss.item(), kl.item(), {}, [p.grad for p in learned(model.policy)]
+        alone = evaluated(model, update, batch)
+        assert_close(found, (*alone[:2], {}, alone[3]))
+        # The next one is evaluated with other weights.
+        perturb(model.policy, 0.01)
+        model.policy.keep_within_bounds()
+
+
+def test_losses_of_an_epoch_do_not_share_their_gradients() -> None:
+    model, update, samples = prepared()
+    minibatches = model.rollout_buffer.minibatches(samples, len(samples.actions) // 2)
+    sums = []
+    for is_compiled in (True, False):
+        model.policy.zero_grad()
+        if not is_compiled:
+            update.compiled_loss = None
+        for loss, _ in list(update.minibatch_losses(minibatches, UpdateMetrics())):
+            loss.backward()
+        sums.append([p.grad for p in learned(model.policy)])
+    for ours, theirs in zip(*sums, strict=True):
+        th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-6)
+
+
+def test_a_features_extractor_that_learns_is_evaluated_for_each_minibatch() -> None:
+    model, update, samples = prepared()
+    layer, extract = nn.Linear(3, 3), model.policy.actor_critic_features
+    model.policy.actor_critic_features = lambda observations: tuple(
+        layer(features) for features in extract(observations)
+    )
+    for loss, _ in update.minibatch_losses(
+        model.rollout_buffer.minibatches(samples, 10), UpdateMetrics()
+    ):
+        layer.zero_grad()
+        loss.backward()
+        assert layer.weight.grad.abs().max() > 0

@@ -11,8 +11,8 @@ from torch import nn
 from torch.distributions import Independent, Normal
 
 from sb3_policyflow import PolicyFlow
-from sb3_policyflow.common.buffers import FlowRolloutBufferSamples
 from sb3_policyflow.common.losses import clipped_surrogate
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.policyflow.policies import PolicyFlowPolicy, PolicyFlowRecord
 from sb3_policyflow.policyflow.policyflow import PathSamples, PolicyFlowUpdate
 from tests.helpers import learned, perturb

@@ -207,7 +207,7 @@ def _regularize(
     sums: NDArray[np.float64],
 ) -> None:
     """Add a row's change of the velocity and its Brownian regularizer, with the gradient."""
-    scores = targets.scores[first.entries[row]]
+    scores = targets.scores[row]
     score, of_velocity, of_point = scores[0], scores[1], scores[2]
     weight, change = F(1.0) if options.sums_dimensions else F(1.0) / F(velocity.size), F(0.0)
     slope = F(2.0 * options.brownian_coef) * weight / F(first.points.shape[0])
