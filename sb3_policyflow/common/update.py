@@ -109,25 +109,23 @@ class FlowUpdate(ABC):
         :param minibatches: Minibatches, with what was drawn for them.
         :param metrics: Takes what is to be logged.
         """
-        samples, evaluate = minibatches.shuffled, None
-        if samples is not None and not learns_features(self.policy):
-            # What no step of the optimizer changes, is prepared for all minibatches at once.
-            features = self.policy.actor_critic_features(samples.observations)
-            if not any(values.requires_grad for values in features):
-                evaluate = self._compiled(samples, *features)
+        evaluate = self._prepared(minibatches.shuffled)
         if evaluate is None:
             yield from (self.loss(batch, metrics) for batch in minibatches)
             return
         for part in minibatches.parts:
             yield self._logged(evaluate(part), metrics)
 
-    def _compiled(
-        self, samples: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+    def _prepared(
+        self, samples: FlowRolloutBufferSamples | None
     ) -> Callable[[slice], CompiledTerms] | None:
-        """What takes the place of the formulas, if anything can."""
-        if self.compiled_loss is None or self.pull is not None:
+        """What evaluates the minibatches among some samples, if no step changes their features."""
+        if samples is None or self.compiled_loss is None or learns_features(self.policy):
             return None
-        return self.compiled_loss(samples, features, critic_features)
+        features = self.policy.actor_critic_features(samples.observations)
+        if any(values.requires_grad for values in features):
+            return None
+        return self.compiled_loss(samples, *features)
 
     @staticmethod
     def _logged(compiled: CompiledTerms, metrics: "UpdateMetrics") -> tuple[Loss, th.Tensor]:
@@ -145,9 +143,10 @@ class FlowUpdate(ABC):
         :return: The loss, and the divergence from the reference policy, without dimensions.
         """
         features, critic_features = self.policy.actor_critic_features(batch.observations)
-        evaluate = self._compiled(batch, features, critic_features)
-        if evaluate is not None:
-            return self._logged(evaluate(slice(None)), metrics)
+        if self.compiled_loss is not None:
+            evaluate = self.compiled_loss(batch, features, critic_features)
+            if evaluate is not None:
+                return self._logged(evaluate(slice(None)), metrics)
         terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
         if self.pull is not None:
             pull = self.pull.loss(batch, features)

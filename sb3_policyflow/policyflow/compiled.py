@@ -27,6 +27,7 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     has_known_formulas = (
         SURROGATES[update.trust_region] is clipped_surrogate
         and update.uniform_targets is None
+        and update.pull is None
         and getattr(type(policy), "values", None) is FlowPolicy.values
         and type(interpolant).brownian_residual is Interpolant.brownian_residual
     )
