@@ -65,6 +65,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     policy_base: ClassVar[type[FlowPolicy]]
     update_class: ClassVar[type[FlowUpdate]]
     former_names: ClassVar[Mapping[str, str]] = options.FORMER_NAMES
+    former_defaults: ClassVar[Mapping[str, Any]] = options.FORMER_DEFAULTS
+    """Defaults of the policy in version 0.1, where they are others now."""
     former_values: ClassVar[Mapping[str, Any]] = {"has_former_defaults": True}
     has_former_defaults: bool = False
     """Whether a file of version 0.1 was loaded: what it does not say, had other defaults."""
@@ -179,7 +181,6 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         options.read_loaded_options(self)
-        names.keep_former_defaults(self)
         options.check_algorithm(self)
         self.rollout_buffer_class = checks.choose_buffer_class(
             type(self).__name__, self.rollout_buffer_class, self.observation_space
@@ -187,6 +188,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         own, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self.policy_options}
         super()._setup_model()
         self.policy_kwargs = own
+        names.keep_former_defaults(self)
         self.known_policy_options = options.values_on_policy(self)
         self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:
@@ -269,8 +271,17 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         return rollout
 
     def _minibatches(self, samples: FlowRolloutBufferSamples, size: int) -> Minibatches:
-        """The minibatches of an epoch."""
-        minibatches = self.rollout_buffer.minibatches(samples, size)
+        """The minibatches of an epoch.
+
+        :raises TypeError: If they are those of a buffer of version 0.1.
+        """
+        minibatches: Any = self.rollout_buffer.minibatches(samples, size)
+        if not isinstance(minibatches, Minibatches):
+            raise TypeError(
+                f"{type(self.rollout_buffer).__name__}.minibatches must return a "
+                "sb3_policyflow.common.minibatches.Minibatches, which takes the samples, their "
+                f"order and the size, and not a {type(minibatches).__name__}."
+            )
         if self.normalize_advantage and self.advantage_scope == "minibatch":
             minibatches.map_advantages(self.ranks.normalized)
         return minibatches

@@ -49,11 +49,13 @@ class Minibatches:
 
     def __iter__(self) -> Iterator[FlowRolloutBufferSamples]:
         """Go through the minibatches."""
-        for part in self.parts:
-            if self.shuffled is not None:
-                yield rows(self.shuffled, part)
-            else:
-                yield rows(self._samples, self._order[part])
+        return map(self.at, self.parts)
+
+    def at(self, part: slice) -> FlowRolloutBufferSamples:
+        """The minibatch at one of the ``parts``."""
+        if self.shuffled is not None:
+            return rows(self.shuffled, part)
+        return rows(self._samples, self._order[part])
 
     def map_advantages(self, function: Callable[[th.Tensor], th.Tensor]) -> None:
         """Replace the advantages of each minibatch.

@@ -19,9 +19,6 @@ FORMER_VALUES: dict[tuple[str, object], str] = {
 }
 """Present values of options by option and former value."""
 
-FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
-"""Defaults of policies in version 0.1, where they are others now."""
-
 OF_GSDE = "it belongs to gSDE, which flow policies do not support. Leave it out."
 FOREIGN_ARGUMENTS = {
     "use_sde": OF_GSDE,
@@ -130,19 +127,30 @@ def settable_options(policy_class: type[Any]) -> set[str]:
 def keep_former_defaults(model: Any) -> None:
     """Give the policy of a file of version 0.1 the defaults of that version.
 
-    :param model: An algorithm whose attributes have just been loaded, or set.
+    A class of the user's own that has another default, or hands one on to its base, keeps it.
+
+    :param model: An algorithm whose policy has just been made.
     """
     if not model.has_former_defaults:
         return
     model.has_former_defaults = False
     kwargs = model.policy_kwargs or {}
     given = with_present_names(kwargs, model.former_names, warn=False).keys() | model.policy_options
-    taken = policy_parameters(model.policy_class)
-    for name, value in FORMER_DEFAULTS.items():
-        # A class of the user's own may have a default of its own.
-        own, base = taken.get(name), policy_parameters(model.policy_base).get(name)
-        if name not in given and own and base and own.default == base.default:
+    present = policy_parameters(model.policy_base)
+    for name, value in model.former_defaults.items():
+        if name in given or name not in present or name in _own_parameters(model.policy_class):
+            continue
+        if getattr(model.policy, name) == present[name].default:
             model.policy_options[name] = value
+            setattr(model, name, value)
+
+
+def _own_parameters(policy_class: type[Any]) -> set[str]:
+    """What constructors of a policy take that are not this package's."""
+    package = __name__.partition(".")[0]
+    own = [cls for cls in policy_class.__mro__ if cls.__module__.partition(".")[0] != package]
+    constructors = [vars(cls)["__init__"] for cls in own if "__init__" in vars(cls)]
+    return {name for init in constructors for name in inspect.signature(init).parameters}
 
 
 def policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
@@ -150,7 +158,8 @@ def policy_parameters(policy_class: type[Any]) -> dict[str, inspect.Parameter]:
     found: dict[str, inspect.Parameter] = {}
     for cls in policy_class.__mro__:
         if "__init__" in vars(cls) and hasattr(cls, "option_checks"):
-            found |= named_parameters(inspect.signature(vars(cls)["__init__"]))
+            parameters = named_parameters(inspect.signature(vars(cls)["__init__"]))
+            found |= {name: p for name, p in parameters.items() if name not in found}
     for name in ("self", "observation_space", "action_space", "lr_schedule", "use_sde"):
         found.pop(name, None)
     return found

@@ -104,6 +104,8 @@ FORMER_NAMES = {
     "kl_window": "lr_adaptation_kwargs.window",
 }
 """Present names of the shared options, and of an attribute in files, by former ones."""
+FORMER_DEFAULTS = {"latent_std": 1.0, "deterministic_action": "zero"}
+"""Options of policies that had another default in version 0.1, with that default."""
 
 
 def shares_options(

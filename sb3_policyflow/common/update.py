@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
-from sb3_policyflow.kernels import clip_gradients_in_place, learns_features, step_in_place
+from sb3_policyflow.kernels import clip_gradients_in_place, has_fixed_features, step_in_place
 
 
 class PolicyTerms(NamedTuple):
@@ -48,12 +48,10 @@ class CompiledTerms(NamedTuple):
     maxima: dict[str, float]
 
 
-CompiledLoss = Callable[
-    [FlowRolloutBufferSamples, th.Tensor, th.Tensor], Callable[[slice], CompiledTerms] | None
-]
-"""Takes samples, and the features of actor and critic, and gives what evaluates some of them.
-
-None where kernels cannot work."""
+EvaluateRows = Callable[[slice], CompiledTerms | None]
+"""Evaluates the loss of some of the samples that were prepared; None if it no longer can."""
+CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], EvaluateRows | None]
+"""Takes samples, and the features of actor and critic; None where kernels cannot work."""
 
 
 class FlowUpdate(ABC):
@@ -66,7 +64,7 @@ class FlowUpdate(ABC):
     Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
     ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
     None for 1. If ``trains_actor`` is False, only the critic learns from the rollout. If there is a
-    ``compiled_loss``, it takes the place of the formulas in :meth:`loss` where it can.
+    ``compiled_loss``, it takes the place of :meth:`loss` where it can.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
@@ -110,22 +108,29 @@ class FlowUpdate(ABC):
         :param metrics: Takes what is to be logged.
         """
         evaluate = self._prepared(minibatches.shuffled)
-        if evaluate is None:
-            yield from (self.loss(batch, metrics) for batch in minibatches)
-            return
         for part in minibatches.parts:
-            yield self._logged(evaluate(part), metrics)
+            compiled = None if evaluate is None else evaluate(part)
+            if compiled is None:
+                yield self.loss(minibatches.at(part), metrics)
+            else:
+                yield self._logged(compiled, metrics)
 
-    def _prepared(
-        self, samples: FlowRolloutBufferSamples | None
-    ) -> Callable[[slice], CompiledTerms] | None:
-        """What evaluates the minibatches among some samples, if no step changes their features."""
-        if samples is None or self.compiled_loss is None or learns_features(self.policy):
+    def _prepared(self, samples: FlowRolloutBufferSamples | None) -> EvaluateRows | None:
+        """What evaluates minibatches of some samples, if no step changes their features."""
+        is_known = self.compiled_loss is not None and type(self).loss is FlowUpdate.loss
+        if samples is None or not is_known or not has_fixed_features(self.policy):
             return None
         features = self.policy.actor_critic_features(samples.observations)
-        if any(values.requires_grad for values in features):
+        has_gradients = any(values.requires_grad for values in features)
+        return None if has_gradients else self._compiled(samples, *features)
+
+    def _compiled(
+        self, samples: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
+    ) -> EvaluateRows | None:
+        """What takes the place of the formulas, if anything can."""
+        if self.compiled_loss is None or self.pull is not None:
             return None
-        return self.compiled_loss(samples, *features)
+        return self.compiled_loss(samples, features, critic_features)
 
     @staticmethod
     def _logged(compiled: CompiledTerms, metrics: "UpdateMetrics") -> tuple[Loss, th.Tensor]:
@@ -143,10 +148,9 @@ class FlowUpdate(ABC):
         :return: The loss, and the divergence from the reference policy, without dimensions.
         """
         features, critic_features = self.policy.actor_critic_features(batch.observations)
-        if self.compiled_loss is not None:
-            evaluate = self.compiled_loss(batch, features, critic_features)
-            if evaluate is not None:
-                return self._logged(evaluate(slice(None)), metrics)
+        evaluate = self._compiled(batch, features, critic_features)
+        if evaluate is not None and (compiled := evaluate(slice(None))) is not None:
+            return self._logged(compiled, metrics)
         terms = self.terms(batch, features)  # lines 18, 20 and 21: ratio, regularizers
         if self.pull is not None:
             pull = self.pull.loss(batch, features)

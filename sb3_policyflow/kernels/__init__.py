@@ -11,11 +11,11 @@ from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels.critic import KernelCritic
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.gradients import clip_gradients_in_place, step_in_place
-from sb3_policyflow.kernels.inspection import are_in_mode, has_values
+from sb3_policyflow.kernels.inspection import are_in_mode, are_usable, has_values
 from sb3_policyflow.kernels.layouts import LossOptions
 from sb3_policyflow.kernels.losses import EvaluatedLoss, KernelLoss, LossInputs
 from sb3_policyflow.kernels.policies import (
-    learns_features,
+    has_fixed_features,
     reason_kernels_are_off,
     shares_cores,
 )
@@ -27,9 +27,10 @@ __all__ = [
     "LossInputs",
     "LossOptions",
     "are_in_mode",
+    "are_usable",
     "clip_gradients_in_place",
+    "has_fixed_features",
     "has_values",
-    "learns_features",
     "make_velocity_field",
     "reason_kernels_are_off",
     "shares_cores",

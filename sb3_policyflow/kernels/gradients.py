@@ -35,42 +35,30 @@ def clip_gradients_in_place(grads: Sequence[th.Tensor], max_norm: float) -> floa
 
 @dataclass(frozen=True)
 class _AdamReading:
-    """The tensors that a step takes of a group, and where they were when they were checked.
+    """Tensors that a step takes of a group, and where they were when they were checked.
 
-    ``tensors`` are the gradients of its n parameters, these, both moments and the steps.
+    ``tensors`` are its n parameters with a gradient, then their first moments, second moments and
+    numbers of steps.
     """
 
     tensors: list[th.Tensor]
     places: list[int]
 
-    @property
-    def n_parameters(self) -> int:
-        """How many parameters have a gradient."""
-        return len(self.tensors) // 5
-
-    def is_same(self, other: "_AdamReading", start: int = 0) -> bool:
-        """Whether another reading, from a tensor on, is of these tensors in the same memory."""
-        tensors = self.tensors[start:], other.tensors[start:]
-        return self.places[start:] == other.places[start:] and all(map(operator.is_, *tensors))
-
-    def is_usable(self, known: "_AdamReading | None") -> bool:
-        """Whether kernels can work on the tensors.
-
-        :param known: A reading on which they can. Autograd makes new gradients for each step.
-        """
-        only_gradients = known is not None and self.is_same(known, self.n_parameters)
-        return are_usable(self.tensors[: self.n_parameters] if only_gradients else self.tensors)
-
     @cached_property
     def addresses(self) -> Integers:
-        """Where they are, shape (5, n)."""
-        return np.array(self.places, dtype=np.int64).reshape(5, -1)
+        """Where they are, shape (4, n)."""
+        return np.array(self.places, dtype=np.int64).reshape(4, -1)
 
     @cached_property
     def sizes(self) -> Integers:
         """How many numbers each of the n parameters has."""
-        gradients = self.tensors[: self.n_parameters]
-        return np.array([gradient.numel() for gradient in gradients], dtype=np.int64)
+        parameters = self.tensors[: len(self.tensors) // 4]
+        return np.array([parameter.numel() for parameter in parameters], dtype=np.int64)
+
+    def is_same(self, other: "_AdamReading") -> bool:
+        """Whether another reading is of these tensors in the same memory."""
+        is_known = self.places == other.places and len(self.tensors) == len(other.tensors)
+        return is_known and all(map(operator.is_, self.tensors, other.tensors))
 
 
 _readings: WeakKeyDictionary[th.optim.Optimizer, list[_AdamReading]] = WeakKeyDictionary()
@@ -89,18 +77,34 @@ def step_in_place(optimizer: th.optim.Optimizer) -> bool:
     groups = [tensors for tensors in found if tensors is not None]
     if len(groups) < len(found):
         return False
-    readings = [_AdamReading(tensors, [t.data_ptr() for t in tensors]) for tensors in groups]
-    known = dict(enumerate(_readings.get(optimizer, ())))
-    for i, new in enumerate(readings):
-        old = known.get(i)
-        if old is not None and new.is_same(old):
-            readings[i] = old
-        elif not new.is_usable(old):
-            return False
-    _readings[optimizer] = readings
-    for group, reading in zip(optimizer.param_groups, readings, strict=True):
-        kernels.adam(reading.addresses, reading.sizes, _adam_options(group))
+    gradients = [
+        [p.grad for p in group["params"] if p.grad is not None] for group in optimizer.param_groups
+    ]
+    readings = _checked_readings(optimizer, groups)
+    if readings is None or not all(map(are_usable, gradients)):
+        return False
+    for group, grads, reading in zip(optimizer.param_groups, gradients, readings, strict=True):
+        table = np.concatenate((addresses(grads)[None], reading.addresses))
+        kernels.adam(table, reading.sizes, _adam_options(group))
     return True
+
+
+def _checked_readings(
+    optimizer: th.optim.Optimizer, groups: list[list[th.Tensor]]
+) -> list[_AdamReading] | None:
+    """The readings of an optimizer's groups, or None if kernels cannot work on them.
+
+    :param optimizer: The optimizer.
+    :param groups: The tensors of each group.
+    """
+    readings = [_AdamReading(tensors, [t.data_ptr() for t in tensors]) for tensors in groups]
+    known = _readings.get(optimizer, [])
+    if len(known) == len(readings) and all(map(_AdamReading.is_same, known, readings)):
+        return known
+    if not all(are_usable(reading.tensors) for reading in readings):
+        return None
+    _readings[optimizer] = readings
+    return readings
 
 
 def _has_more_to_do(optimizer: Any) -> bool:
@@ -117,7 +121,10 @@ def _has_more_to_do(optimizer: Any) -> bool:
 
 
 def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[th.Tensor] | None:
-    """Gradients, their parameters, both moments and steps of a group; None if it has no state."""
+    """Parameters with gradients, both moments and steps of a group.
+
+    None if there are none yet, or if it has options that the kernel does not know.
+    """
     numbers = (group["lr"], *group["betas"])
     has_numbers = all(isinstance(number, float | int) for number in numbers)
     if not has_numbers or any(group[name] != value for name, value in PLAIN_ADAM.items()):
@@ -128,7 +135,7 @@ def _adam_tensors(optimizer: Any, group: dict[str, Any]) -> list[th.Tensor] | No
         return None
     kinds = ("exp_avg", "exp_avg_sq", "step")
     moments = (state[kind] for kind in kinds for state in states)
-    return [*(p.grad for p in parameters), *parameters, *moments]
+    return [*parameters, *moments]
 
 
 def _adam_options(group: dict[str, Any]) -> AdamOptions:

@@ -1,7 +1,7 @@
 """The losses of PolicyFlow's actor and of the critic, evaluated and differentiated by kernels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,8 +37,7 @@ class LossInputs(NamedTuple):
     """n samples, with k times for each.
 
     ``features`` and ``critic_features`` (n, ...) may have gradients. ``times`` (n, k), ``points``
-    and ``reference_velocity`` (n, k, dim), ``scores`` (n, k, 3), the interpolant's score
-    coefficients at the times, ``actions`` and ``endpoints`` (n, dim), ``advantages``,
+    and ``reference_velocity`` (n, k, dim), ``actions`` and ``endpoints`` (n, dim), ``advantages``,
     ``old_values`` and ``returns`` (n,) have none.
     """
 
@@ -47,7 +46,6 @@ class LossInputs(NamedTuple):
     times: th.Tensor
     points: th.Tensor
     reference_velocity: th.Tensor
-    scores: th.Tensor
     actions: th.Tensor
     endpoints: th.Tensor
     advantages: th.Tensor
@@ -76,21 +74,28 @@ class KernelLoss:
     + vf_coef * value_loss.
 
     :param options: Options of the losses.
-    :param old_log_std: Of the reference policy's noise, shape (dim,).
-    :param latent_std: Standard deviations of the latents, shape (dim,).
+    :param scores: The interpolant's score coefficients at times (...), each of shape (...).
+    :param old_log_std: Of the reference policy's noise, shape (dim,), without gradient.
+    :param latent_std: Standard deviations of the latents, shape (dim,), without gradient.
     """
 
-    def __init__(self, options: LossOptions, old_log_std: th.Tensor, latent_std: th.Tensor) -> None:
+    def __init__(
+        self,
+        options: LossOptions,
+        scores: Callable[[th.Tensor], tuple[th.Tensor, ...]],
+        old_log_std: th.Tensor,
+        latent_std: th.Tensor,
+    ) -> None:
         self.options = options
-        self.old_log_std: Floats = old_log_std.numpy()
-        self.latent_std: Floats = latent_std.numpy()
+        self.scores = scores
+        self.stds = old_log_std, latent_std
         self._critic = KernelView(read_critic)
 
     def prepare(self, policy: Any, inputs: LossInputs) -> "PreparedLoss | None":
         """Everything but the evaluation, for samples that are evaluated a few at a time.
 
         :param policy: A policy with a velocity field of kernels, a ``noise_log_std`` and SB3's
-            critic. Until the last evaluation its weights may change, but not its modules.
+            critic. Its modules must not change before the last evaluation, but its weights may.
         :param inputs: The samples.
         :return: None where kernels cannot work.
         """
@@ -104,7 +109,7 @@ class KernelLoss:
             note_fallback("parameters have hooks")
             return None
         is_known = actor.supports(inputs.points, inputs.features)
-        if not is_known or not are_usable((log_std, *inputs)):
+        if not is_known or not are_usable((log_std, *self.stds, *inputs)):
             note_fallback("samples are not contiguous float32 on the CPU")
             return None
         return PreparedLoss(self, policy, actor, critic, inputs)
@@ -126,34 +131,25 @@ class PreparedLoss:
         self.loss, self.actor, self.critic = loss, actor, critic
         self._policy, self._inputs = policy, inputs
         self._arrays: Any = LossInputs._make(tensor.detach().numpy() for tensor in inputs)
-        # The gradients of all parameters are one tensor: those of the actor, log_std and critic.
-        tensors = [*actor.parameters, policy.noise_log_std, *critic.tensors]
-        size = sum(tensor.numel() for tensor in tensors)
-        self._flat = th.empty(size, dtype=th.float32, device="cpu")
-        self._gradients = views_like(tensors, self._flat)
+        self._scores: Floats = th.stack(loss.scores(inputs.times), dim=-1).numpy()
+        self.old_log_std, self.latent_std = (std.numpy() for std in loss.stds)
+        self._tensors = [*actor.tensors, *critic.tensors]
+        self._places = [*actor.places, *critic.places]
 
-    def evaluate(self, rows: slice) -> "EvaluatedLoss":
+    def evaluate(self, rows: slice) -> "EvaluatedLoss | None":
         """The loss of some of the samples.
 
         :param rows: Which, with a step of 1.
+        :return: None if weights are no longer where they were: the samples must be prepared again.
         """
+        if [tensor.data_ptr() for tensor in self._tensors] != self._places:
+            return None
         arrays: Any = LossInputs._make(array[rows] for array in self._arrays)
         features, critic_features = (
-            values[rows] if values.requires_grad else values for values in self._inputs[:2]
+            values[rows] if values.requires_grad else values[:0] for values in self._inputs[:2]
         )
         log_std = self._policy.noise_log_std
-        return EvaluatedLoss(self, arrays, log_std, (features, critic_features))
-
-    def gradients(self, flat: Floats, adds_up: bool) -> list[th.Tensor]:
-        """The gradients of the parameters, which are valid until those of other samples are.
-
-        :param flat: Their numbers.
-        :param adds_up: Whether parameters have gradients, which may be those of other samples.
-        """
-        if adds_up:
-            return views_like(self._gradients, th.from_numpy(flat))
-        self._flat.numpy()[:] = flat
-        return self._gradients
+        return EvaluatedLoss(self, arrays, self._scores[rows], log_std, (features, critic_features))
 
 
 class EvaluatedLoss:
@@ -164,19 +160,21 @@ class EvaluatedLoss:
 
     :param prepared: What it is evaluated by.
     :param arrays: The samples.
+    :param scores: The interpolant's score coefficients at their times, shape (n, k, 3).
     :param log_std: Of the noise, which may have a gradient.
-    :param features: Those of actor and critic, of these samples where they have gradients.
+    :param features: Those of actor and critic; no rows of those that have no gradient.
     """
 
     def __init__(
         self,
         prepared: PreparedLoss,
         arrays: Any,
+        scores: Floats,
         log_std: th.Tensor,
         features: tuple[th.Tensor, th.Tensor],
     ) -> None:
-        actor, loss = prepared.actor, prepared.loss
-        self._prepared, self._options = prepared, loss.options
+        actor = prepared.actor
+        self._prepared, self._options = prepared, prepared.loss.options
         self._log_std, self._features = log_std, features
         self._n_samples, self._n_times = shape = arrays.times.shape
         self._embedding = Embedding(actor, arrays.times)
@@ -190,16 +188,14 @@ class EvaluatedLoss:
             arrays.endpoints,
             arrays.advantages,
             reference.reshape(-1, actor.dim),
-            arrays.scores.reshape(-1, 3),
-            loss.latent_std,
+            scores.reshape(-1, 3),
+            prepared.latent_std,
             log_std.detach().numpy(),
-            loss.old_log_std,
+            prepared.old_log_std,
             arrays.old_values,
             arrays.returns,
         )
-        self._grad_features, self._grad_critic_features = (
-            th.empty_like(values if values.requires_grad else values[:0]) for values in features
-        )
+        self._grad_features, self._grad_critic_features = map(th.empty_like, features)
         self._compute()
         self.terms = self._terms()
 
@@ -274,10 +270,9 @@ class EvaluatedLoss:
         """
         actor, critic = self._prepared.actor, self._prepared.critic
         tensors = [*actor.parameters, self._log_std, *critic.tensors]
-        adds_up = any(tensor.is_leaf and tensor.grad is not None for tensor in tensors)
-        gradients = self._prepared.gradients(self._flat, adds_up)
+        gradients = views_like(tensors, th.from_numpy(self._flat))
         tensors += self._features
-        gradients = [*gradients, self._grad_features, self._grad_critic_features]
+        gradients += [self._grad_features, self._grad_critic_features]
         wanted = None if inputs is None else set(inputs)
         roots, root_gradients = list[th.Tensor](), list[th.Tensor]()
         for tensor, gradient in zip(tensors, gradients, strict=True):

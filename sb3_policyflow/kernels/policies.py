@@ -3,12 +3,19 @@
 import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from itertools import chain
 from typing import Any
 
 from sb3_policyflow.kernels.critic import read_critic
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.inspection import KernelView
 from sb3_policyflow.kernels.threads import kernels_have_the_cores
+
+OF_ACTOR_AND_CRITIC = (
+    *("velocity.", "log_std", "latent_std"),
+    *("mlp_extractor.value_net.", "value_net."),
+)
+"""How the names of their parameters and buffers begin, in a policy that kernels know."""
 
 
 def reason_kernels_are_off(policy: Any) -> str | None:
@@ -26,12 +33,15 @@ def reason_kernels_are_off(policy: Any) -> str | None:
     return f"for the critic, {critic}" if isinstance(critic, str) else None
 
 
-def learns_features(policy: Any) -> bool:
-    """Whether the features extractors of a policy have parameters.
+def has_fixed_features(policy: Any) -> bool:
+    """Whether kernels are on, and no step of an optimizer changes what actor and critic are given.
 
-    :param policy: A policy of SB3.
+    :param policy: A policy as above.
     """
-    return any("features_extractor" in name for name, _ in policy.named_parameters())
+    if reason_kernels_are_off(policy) is not None:
+        return False
+    states = chain(policy.named_parameters(), policy.named_buffers())
+    return all(name.startswith(OF_ACTOR_AND_CRITIC) for name, _ in states)
 
 
 def shares_cores(train: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -50,5 +60,6 @@ def shares_cores(train: Callable[[Any], None]) -> Callable[[Any], None]:
 
 def _cores_for(policy: Any) -> AbstractContextManager[None]:
     """A block in which kernels have torch's threads, unless a features extractor needs them."""
-    torch_works = learns_features(policy) or reason_kernels_are_off(policy) is not None
+    parameters = (p for name, p in policy.named_parameters() if "features_extractor" in name)
+    torch_works = next(parameters, None) is not None or reason_kernels_are_off(policy) is not None
     return nullcontext() if torch_works else kernels_have_the_cores()

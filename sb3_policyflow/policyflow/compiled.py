@@ -1,7 +1,6 @@
 """PolicyFlow's loss in one call of a kernel, in place of its formulas."""
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch as th
@@ -9,11 +8,12 @@ import torch as th
 from sb3_policyflow.common.losses import SURROGATES, clipped_surrogate
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.common.update import CompiledLoss, CompiledTerms
+from sb3_policyflow.common.update import CompiledLoss, CompiledTerms, EvaluateRows
 from sb3_policyflow.flows import Interpolant
-from sb3_policyflow.kernels import EvaluatedLoss, KernelLoss, LossInputs, LossOptions
+from sb3_policyflow.kernels import EvaluatedLoss, KernelLoss, LossInputs, LossOptions, are_usable
 
 if TYPE_CHECKING:  # that module imports this one
+    from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
     from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 
 
@@ -27,12 +27,12 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
     has_known_formulas = (
         SURROGATES[update.trust_region] is clipped_surrogate
         and update.uniform_targets is None
-        and update.pull is None
         and getattr(type(policy), "values", None) is FlowPolicy.values
         and type(interpolant).brownian_residual is Interpolant.brownian_residual
     )
-    clip_range = update.clip_range
-    if not has_known_formulas or not isinstance(clip_range, float):
+    clip_range, log_std = update.clip_range, update.reference_log_std
+    stds = log_std, (update.latent_std * th.ones_like(log_std)).detach()
+    if not has_known_formulas or not isinstance(clip_range, float) or not are_usable(stds):
         return None
     unbounded = math.inf
     options = LossOptions(
@@ -46,32 +46,29 @@ def make_compiled_loss(update: "PolicyFlowUpdate") -> CompiledLoss | None:
         vf_coef=update.vf_coef,
         clip_range_vf=unbounded if update.clip_range_vf is None else update.clip_range_vf,
     )
-    return CompiledPolicyFlowLoss(update, options)
+    kernel = KernelLoss(options, interpolant.score_coefficients, *stds)
+    return CompiledPolicyFlowLoss(policy, kernel)
 
 
 class CompiledPolicyFlowLoss:
     """PolicyFlow's loss by a kernel, see :data:`~sb3_policyflow.common.update.CompiledLoss`.
 
-    :param update: The update that it is a part of.
-    :param options: The kernel's options.
+    :param policy: The policy.
+    :param kernel: The kernel.
     """
 
-    def __init__(self, update: "PolicyFlowUpdate", options: LossOptions) -> None:
-        self._policy = update.policy
-        self._scores = update.flow.interpolant.score_coefficients
-        log_std = update.reference_log_std
-        self._kernel = KernelLoss(options, log_std, update.latent_std * th.ones_like(log_std))
+    def __init__(self, policy: "PolicyFlowPolicy", kernel: KernelLoss) -> None:
+        self._policy, self._kernel = policy, kernel
 
     def __call__(
         self, samples: FlowRolloutBufferSamples, features: th.Tensor, critic_features: th.Tensor
-    ) -> Callable[[slice], CompiledTerms] | None:
+    ) -> EvaluateRows | None:
         inputs = LossInputs(
             features=features,
             critic_features=critic_features,
             times=samples.drawn.times,
             points=samples.drawn.points,
             reference_velocity=samples.drawn.reference_velocity,
-            scores=th.stack(self._scores(samples.drawn.times), dim=-1),
             actions=samples.actions,
             endpoints=samples.record.endpoints,
             advantages=samples.advantages,
@@ -82,8 +79,10 @@ class CompiledPolicyFlowLoss:
         return None if prepared is None else lambda rows: _terms(prepared.evaluate(rows))
 
 
-def _terms(evaluated: EvaluatedLoss) -> CompiledTerms:
+def _terms(evaluated: EvaluatedLoss | None) -> CompiledTerms | None:
     """A minibatch's loss by its parts."""
+    if evaluated is None:
+        return None
     means = evaluated.terms._asdict()
     kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
     maxima = {"log_ratio_max": means.pop("log_ratio_max")}

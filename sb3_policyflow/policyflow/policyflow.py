@@ -18,7 +18,7 @@ from sb3_policyflow.common.losses import (
 )
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
-from sb3_policyflow.common.options import FORMER_NAMES, shares_options
+from sb3_policyflow.common.options import FORMER_DEFAULTS, FORMER_NAMES, shares_options
 from sb3_policyflow.common.schedules import Coefficient, parse_schedule
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
@@ -171,6 +171,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         MlpFlowPolicy, CnnFlowPolicy, MultiInputFlowPolicy
     )
     former_names: ClassVar[Mapping[str, str]] = {**FORMER_NAMES, "path": "interpolant"}
+    former_defaults: ClassVar[Mapping[str, Any]] = {**FORMER_DEFAULTS, "n_flow_steps": 12}
     divergence_advice = ", or keep log_std_bounds of the noise away from zero"
     option_checks: ClassVar[Mapping[str, checks.Check]] = {
         "brownian_coef": parse_schedule,

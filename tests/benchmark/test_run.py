@@ -322,7 +322,7 @@ def test_evaluation_leaves_the_training_alone() -> None:
 def test_costs() -> None:
     small: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 1}
     for algorithm, per_action, per_sample in [
-        (PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small), 24, 6),
+        (PolicyFlow("MlpPolicy", "Pendulum-v1", n_times=3, **small), 8, 6),
         (DPPO("MlpPolicy", "Pendulum-v1", n_finetuned_steps=4, **small), 10, 4),
         (PPO("MlpPolicy", "Pendulum-v1", **small), 1, 1),
     ]:

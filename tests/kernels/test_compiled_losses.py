@@ -10,6 +10,7 @@ from sb3_policyflow import PolicyFlow
 from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.kernels import threads
 from sb3_policyflow.kernels.losses import EvaluatedLoss
+from sb3_policyflow.policyflow.compiled import make_compiled_loss
 from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from tests.helpers import collected, learned, perturb, train
 
@@ -243,3 +244,88 @@ def test_a_features_extractor_that_learns_is_evaluated_for_each_minibatch() -> N
         layer.zero_grad()
         loss.backward()
         assert layer.weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    "make", [lambda std: std.to(th.bfloat16), lambda std: std.double(), lambda std: std.to("meta")]
+)
+def test_noise_that_is_not_float32_on_the_cpu_is_left_to_the_formulas(make: Any) -> None:
+    _, update, _ = prepared()
+    update.reference_log_std = make(update.reference_log_std)
+    assert make_compiled_loss(update) is None
+
+
+class Replacing(th.optim.SGD):
+    """An optimizer that puts new memory in the place of the old."""
+
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
+        for parameter in self.param_groups[0]["params"]:
+            if parameter.grad is not None:
+                parameter.data = parameter.data - self.param_groups[0]["lr"] * parameter.grad
+
+
+def test_weights_may_move_between_minibatches() -> None:
+    found = []
+    for optimizer in (Replacing, th.optim.SGD):
+        model = PolicyFlow(
+            "MlpPolicy",
+            "Pendulum-v1",
+            learning_rate=1e-2,
+            policy_kwargs={"optimizer_class": optimizer, "optimizer_kwargs": {}},
+            n_steps=32,
+            batch_size=8,
+            seed=0,
+        )
+        train(model, 64)
+        found.append(learned(model.policy))
+    for ours, theirs in zip(*found, strict=True):
+        th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_of_a_minibatch_are_its_own() -> None:
+    model, update, samples = prepared()
+    minibatches = model.rollout_buffer.minibatches(samples, 10)
+    kept = []
+    for loss, _ in update.minibatch_losses(minibatches, UpdateMetrics()):
+        model.policy.zero_grad()
+        loss.backward()
+        kept.append(model.policy.value_net.weight.grad)
+    assert len({gradient.data_ptr() for gradient in kept}) == len(kept)
+    assert not th.equal(kept[0], kept[1])
+
+
+class RunningFeatures(nn.BatchNorm1d):
+    """State without parameters."""
+
+    def __init__(self) -> None:
+        super().__init__(3, affine=False)
+
+
+@pytest.mark.parametrize("attribute", ["features_extractor", "encoder"])
+def test_what_learns_or_counts_before_the_actor_sees_minibatches(attribute: str) -> None:
+    model, update, samples = prepared()
+    sizes, extract = [], model.policy.actor_critic_features
+    counting = RunningFeatures()
+    setattr(model.policy, attribute, counting)
+
+    def features(observations: Any) -> tuple[th.Tensor, th.Tensor]:
+        sizes.append(len(observations))
+        return counting(extract(observations)[0]), extract(observations)[1]
+
+    model.policy.actor_critic_features = features
+    minibatches = model.rollout_buffer.minibatches(samples, 10)
+    list(update.minibatch_losses(minibatches, UpdateMetrics()))
+    assert sizes == [len(batch.actions) for batch in minibatches]
+
+
+def test_a_pull_is_not_left_out() -> None:
+    model, rollout = collected(PolicyFlow)
+    model.cloned_parameters = {
+        name: value.clone() + 0.1 for name, value in model.policy.state_dict().items()
+    }
+    model.imitation_coef = 0.5
+    update = PolicyFlowUpdate(model, rollout)
+    samples = rollout._replace(drawn=update.draw())
+    metrics = UpdateMetrics()
+    list(update.minibatch_losses(model.rollout_buffer.minibatches(samples), metrics))
+    assert metrics.summary()["imitation_loss"] > 0

@@ -32,10 +32,13 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn.utils import parameters_to_vector
 
+from sb3_policyflow import PolicyFlow
 from sb3_policyflow.flows import Interpolant
+from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
 
 SAVED = Path(__file__).parents[1] / "data" / "v0.1"
 # Rounding differs between processors, by less than 1e-6; almost any option makes more than 1e-4.
@@ -74,6 +77,50 @@ def test_policies_act_as_they_did(algorithm: type[Any]) -> None:
     expected = np.load(saved(algorithm, "npz"))
     actions, _ = policy.predict(expected["observations"], deterministic=True)
     np.testing.assert_allclose(actions, expected["actions"], **TOLERANCE)
+
+
+def test_models_without_options_have_the_defaults_of_0_1(
+    algorithm: type[Any], tmp_path: Path
+) -> None:
+    algorithm("MlpPolicy", "Pendulum-v1", n_steps=32, batch_size=16).save(tmp_path / "model")
+    data, parameters, others = load_from_zip_file(tmp_path / "model")
+    assert data is not None
+    assert data.pop("has_former_defaults") is False  # files of 0.1 do not have it
+    save_to_zip_file(tmp_path / "former", data, parameters, others)
+    policy = algorithm.load(tmp_path / "former", device="cpu").policy
+    assert policy.deterministic_action == "zero"
+    if algorithm.__name__ != "DPPO":
+        expected = {"PolicyFlow": (1.0, 12), "FPO": (None, 10)}[algorithm.__name__]
+        assert (getattr(policy, "latent_std", None), policy.n_flow_steps) == expected
+
+
+class OwnDefault(PolicyFlowPolicy):
+    """Has a default of its own."""
+
+    def __init__(self, *args: Any, n_flow_steps: int = 4, **kwargs: Any) -> None:
+        super().__init__(*args, n_flow_steps=n_flow_steps, **kwargs)
+
+
+class HandsOn(PolicyFlowPolicy):
+    """Gives an option to its base."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, n_flow_steps=3, **kwargs)
+
+
+@pytest.mark.parametrize(("policy", "n_flow_steps"), [(OwnDefault, 4), (HandsOn, 3)])
+def test_policies_of_the_users_own_keep_their_defaults(
+    policy: type[Any], n_flow_steps: int, tmp_path: Path
+) -> None:
+    PolicyFlow(policy, "Pendulum-v1", n_steps=32, batch_size=16).save(tmp_path / "model")
+    data, parameters, others = load_from_zip_file(tmp_path / "model")
+    assert data is not None
+    del data["has_former_defaults"]
+    save_to_zip_file(tmp_path / "former", data, parameters, others)
+    for path in ("former", "again"):
+        model = PolicyFlow.load(tmp_path / path, device="cpu")
+        assert (model.policy.n_flow_steps, model.policy.latent_std) == (n_flow_steps, 1.0)
+        model.save(tmp_path / "again")
 
 
 def former_residual(

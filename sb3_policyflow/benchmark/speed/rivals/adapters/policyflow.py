@@ -10,5 +10,5 @@ from sb3_policyflow.benchmark.speed.rivals.settings import Setting
 
 
 def make(setting: Setting) -> Callable[[], None]:
-    """PolicyFlow with its defaults: 12 midpoint steps, and embeddings of 64."""
+    """PolicyFlow with its defaults: 4 midpoint steps, and embeddings of 64."""
     return make_with(PolicyFlow, setting, {"activation_fn": nn.Tanh, "embedding_dim": 64})
