@@ -27,18 +27,30 @@ CHOICES = (*MAIN, "predict", "memory", "growth", "isaaclab")
 DEFAULT = (*MAIN, "predict", "memory")
 
 
+ACTIONS = {
+    "deterministic": ("mode", True),
+    'deterministic, with `deterministic_action="zero"`': ("zero", True),
+    "drawn": ("mode", False),
+}
+"""Kinds of actions, with PolicyFlow's ``deterministic_action`` and whether they are so."""
+
+
 def predict_times(repetitions: int) -> dict[str, Any]:
     """Prediction of one action for HalfCheetah-v5, as a robot or ``enjoy`` asks for it."""
     setting = halfcheetah()
     models = {name: make() for name, make in setting.makers.items()}
     env: Any = models["PPO"].env
-    observation = env.reset()[0]
-    calls = {
-        name: partial(model.predict, observation, deterministic=True)
-        for name, model in models.items()
-    }
-    seconds = time_calls(calls, repetitions)
-    return {"seconds": seconds, "ratio": seconds["PolicyFlow"] / seconds["PPO"]}
+    observation, figures = env.reset()[0], {}
+    policy: Any = models["PolicyFlow"].policy
+    for action, (policy.deterministic_action, deterministic) in ACTIONS.items():
+        calls = {
+            name: partial(model.predict, observation, deterministic=deterministic)
+            for name, model in models.items()
+        }
+        seconds = time_calls(calls, repetitions)
+        ratio = seconds["PolicyFlow"] / seconds["PPO"]
+        figures[action] = {"seconds": seconds, "ratio": ratio}
+    return figures
 
 
 def memory_of(name: str, maker: str) -> float:
@@ -97,11 +109,14 @@ def growth_table(what: str, results: Sequence[dict[str, Any]]) -> str:
     return markdown_table([what, "PolicyFlow, ms", "PPO, ms", "ratio"], rows)
 
 
-def calls_table(result: dict[str, Any]) -> str:
-    """One row for ``predict``."""
-    times = [f"{1e6 * result['seconds'][name]:.0f}" for name in ("PolicyFlow", "PPO")]
+def calls_table(figures: dict[str, Any]) -> str:
+    """A row for each kind of action of ``predict``."""
     header = ["predict, one observation", "PolicyFlow, us", "PPO, us", "ratio"]
-    return markdown_table(header, [["HalfCheetah-v5", *times, f"**{result['ratio']:.2f}**"]])
+    rows = []
+    for action, result in figures.items():
+        times = [f"{1e6 * result['seconds'][name]:.0f}" for name in ("PolicyFlow", "PPO")]
+        rows.append([action, *times, f"**{result['ratio']:.2f}**"])
+    return markdown_table(header, rows)
 
 
 def memory_table(results: dict[str, dict[str, float]]) -> str:
