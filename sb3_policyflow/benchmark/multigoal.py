@@ -110,10 +110,13 @@ def _row(name: str, results: Sequence[Result]) -> list[str]:
 def draw(folder: Path, results: Sequence[Result]) -> None:
     """Write the figure of each variant's first seed, and the table of all."""
     first = {result.run.name: result.run for result in reversed(results)}
+    differ = len({run.steps for run in first.values()}) > 1
     trajectories = {
-        VARIANTS[name].title: load_trajectories(first[name], folder)
-        for name in VARIANTS
-        if name in first
+        variant.title + (f", {run.steps / 1e6:g} M steps" if differ else ""): load_trajectories(
+            run, folder
+        )
+        for name, variant in VARIANTS.items()
+        if (run := first.get(name)) is not None
     }
     goals_figure(trajectories).savefig(folder / "multigoal.png")
     (folder / "multigoal.md").write_text(goals_table(results), encoding="utf-8")
