@@ -271,12 +271,8 @@ def test_logged_keys_of_ppo_are_there(algorithm: type[Any], tmp_path: Path) -> N
 SLOWER = pytest.mark.xfail(
     strict=False, reason="without Gaussian noise of their own they learn slower than PPO"
 )
-ALMOST = pytest.mark.xfail(strict=False, reason="89.4: of five seeds four learn it in time")
-LEARN = [(PPO, 0), *((PolicyFlow, seed) for seed in range(1, 5))]
-LEARN_SLOWER = [
-    pytest.param(PolicyFlow, 0, marks=ALMOST),
-    *(pytest.param(algorithm, 0, marks=SLOWER) for algorithm in (FPO, DPPO)),
-]
+LEARN = [(PPO, 0), *((PolicyFlow, seed) for seed in range(5))]
+LEARN_SLOWER = [pytest.param(algorithm, 0, marks=SLOWER) for algorithm in (FPO, DPPO)]
 
 
 @pytest.mark.slow
