@@ -112,7 +112,7 @@ def draw(folder: Path, results: Sequence[Result]) -> None:
     first = {result.run.name: result.run for result in reversed(results)}
     differ = len({run.steps for run in first.values()}) > 1
     trajectories = {
-        variant.title + (f", {run.steps / 1e6:g} M steps" if differ else ""): load_trajectories(
+        variant.title + (f"\n{run.steps / 1e6:g} M steps" if differ else ""): load_trajectories(
             run, folder
         )
         for name, variant in VARIANTS.items()
