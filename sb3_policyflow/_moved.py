@@ -38,7 +38,7 @@ MOVED = {
     "common.metrics": "common.update",
     "common.ode_policy": "common.policies",
     "common.on_policy_algorithm": "common.algorithm",
-    "common.optimisation": "common.update",
+    "common.optimisation": "common.optimization",
     "common.saving": "resilience.saving",
     "common.type_aliases": "common.tree",
     "common.workers": "resilience.workers",

@@ -11,7 +11,12 @@ from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
-from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
+from sb3_policyflow.common.minibatches import (
+    FlowRolloutBufferSamples,
+    Minibatches,
+    minibatches_of,
+)
+from sb3_policyflow.common.optimization import check_step, clip_gradients, take_step
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -25,9 +30,6 @@ from sb3_policyflow.common.update import (
     Loss,
     UpdateMetrics,
     check_model,
-    check_step,
-    clip_gradients,
-    take_step,
 )
 from sb3_policyflow.device import environments
 from sb3_policyflow.distributed.ranks import Ranks, join, training_of
@@ -271,17 +273,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         return rollout
 
     def _minibatches(self, samples: FlowRolloutBufferSamples, size: int) -> Minibatches:
-        """The minibatches of an epoch.
-
-        :raises TypeError: If they are those of a buffer of version 0.1.
-        """
-        minibatches: Any = self.rollout_buffer.minibatches(samples, size)
-        if not isinstance(minibatches, Minibatches):
-            raise TypeError(
-                f"{type(self.rollout_buffer).__name__}.minibatches must return a "
-                "sb3_policyflow.common.minibatches.Minibatches, which takes the samples, their "
-                f"order and the size, and not a {type(minibatches).__name__}."
-            )
+        """The minibatches of an epoch."""
+        minibatches = minibatches_of(self.rollout_buffer, samples, size)
         if self.normalize_advantage and self.advantage_scope == "minibatch":
             minibatches.map_advantages(self.ranks.normalized)
         return minibatches

@@ -74,3 +74,21 @@ class Minibatches:
             advantages = ordered.new_empty(ordered.shape)
             advantages[self._order] = ordered
             self._samples = self._samples._replace(advantages=advantages)
+
+
+def minibatches_of(buffer: Any, samples: FlowRolloutBufferSamples, size: int) -> Minibatches:
+    """The minibatches that a rollout buffer makes of its samples.
+
+    :param buffer: The buffer, whose class may be the user's own.
+    :param samples: The samples.
+    :param size: Samples in a minibatch.
+    :raises TypeError: If the buffer's ``minibatches`` is that of version 0.1.
+    """
+    found = buffer.minibatches(samples, size)
+    if not isinstance(found, Minibatches):
+        raise TypeError(
+            f"{type(buffer).__name__}.minibatches must return a "
+            "sb3_policyflow.common.minibatches.Minibatches, which takes the samples, their "
+            f"order and the size, and not a {type(found).__name__}."
+        )
+    return found

@@ -12,8 +12,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 
+from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
 from sb3_policyflow.common.schedules import parse_schedule
-from sb3_policyflow.common.update import clip_gradients, make_optimizer
 from sb3_policyflow.imitation.losses import cloning_losses
 from sb3_policyflow.imitation.options import CloningOptions
 from sb3_policyflow.imitation.samples import CloningSamples

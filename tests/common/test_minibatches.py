@@ -6,7 +6,7 @@ import pytest
 import torch as th
 
 from sb3_policyflow.common import minibatches
-from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
+from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches, minibatches_of
 from sb3_policyflow.distributed.ranks import Alone
 
 
@@ -42,3 +42,12 @@ def test_advantages_of_the_rollout_stay() -> None:
     found = Minibatches(samples, th.arange(6), 3)
     found.map_advantages(lambda values: 0 * values)
     assert samples.advantages.tolist() == [0, 1, 4, 9, 16, 25]
+
+
+def test_a_buffer_whose_minibatches_are_of_an_earlier_version_is_named() -> None:
+    class Mine:
+        def minibatches(self, samples: Any, size: int) -> Any:
+            return iter([samples])
+
+    with pytest.raises(TypeError, match=r"Mine\.minibatches must return .*Minibatches"):
+        minibatches_of(Mine(), samples_of(4), 2)

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_policyflow.common.update import clip_gradients, make_optimizer
+from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
 
 # In float32 a kernel clips, in float64 torch does.
 DTYPES = [th.float32, th.float64]

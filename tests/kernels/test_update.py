@@ -12,7 +12,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.common.update import UpdateMetrics, clip_gradients, make_optimizer
+from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
+from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.kernels.compiler import SWITCH, load_kernels
 from sb3_policyflow.policyflow.policyflow import PolicyFlowUpdate
 from tests.helpers import learned

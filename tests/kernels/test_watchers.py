@@ -12,7 +12,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_policyflow.common.update import clip_gradients
+from sb3_policyflow.common.optimization import clip_gradients
 from sb3_policyflow.kernels import reason_kernels_are_off
 from tests.helpers import SMALL, TINY
 from tests.kernels.plain import make_field
