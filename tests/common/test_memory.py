@@ -1,5 +1,6 @@
 """What an update takes is in proportion to its minibatch where rows are large, as PPO's is."""
 
+import os
 import subprocess
 import sys
 from typing import Any
@@ -117,21 +118,26 @@ from tests.common.test_memory import Images
 from tests.helpers import TINY, collect
 algorithm = getattr(stable_baselines3, sys.argv[1], None) or getattr(sb3_policyflow, sys.argv[1])
 model = collect(algorithm("CnnPolicy", Images(), n_steps=8192, batch_size=64, n_epochs=1))
-def peak():  # of this program, where ru_maxrss may be that of the one that started it
-    return int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
-before = peak()
+def memory(kind):  # of this program, where ru_maxrss may be that of the one that started it
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(kind + r":\\s*(\\d+)", status)[1])
+model.train()  # what libraries keep for themselves is not counted
+Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+before = memory("VmRSS")
 model.train()
-print((peak() - before) / 1024)
+print((memory("VmHWM") - before) / 1024)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="it reads /proc")
+@pytest.mark.skipif(
+    not os.access("/proc/self/clear_refs", os.W_OK), reason="it needs Linux's count of the memory"
+)
 def test_peak_of_an_update_from_images_is_near_that_of_ppo(algorithm: type[Any]) -> None:
-    """It was thirty times as much; the bound leaves room for what the allocator does."""
+    """It was 250 MB more; the bound leaves room for what the allocator does."""
 
     def peak(name: str) -> float:
         command = [sys.executable, "-W", "ignore", "-c", PEAK, name]
         return float(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
 
-    assert peak(algorithm.__name__) < 1.6 * peak("PPO") + 20
+    assert peak(algorithm.__name__) < peak("PPO") + 20
