@@ -26,7 +26,13 @@ from sb3_policyflow.common.names import (
 )
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names
-from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
+from sb3_policyflow.flows import (
+    INITIALIZATIONS,
+    Flow,
+    MatchingSamples,
+    VelocityField,
+    draw_matching,
+)
 from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
 from sb3_policyflow.kernels import KernelCritic, are_in_mode, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import check_actions
@@ -62,7 +68,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
     :param frequency_scale: Standard deviation of the frequencies that are drawn.
     :param initialization: "orthogonal", "glorot", "glorot_zero_output" or "zero".
     :param deterministic_action: What ``predict(deterministic=True)`` returns: "mode", of the end
-        points of 32 fixed latents the one around which the others lie most densely; "zero", that of
+        points of 16 fixed latents the one around which the others lie most densely; "zero", that of
         z = 0, which may lie between modes; or "drawn", that of a random latent. May be set later.
     :raises ValueError: If an option is not supported.
     """
@@ -253,6 +259,15 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
             size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
             return scale * th.randn(size, device=features.device, dtype=features.dtype), None
         candidates = scale * candidate_latents(self.action_dim).to(features)
+        return self.densest(candidates, features)
+
+    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Of latents (k, action_dim) the one whose end point has the most others around it.
+
+        :param candidates: The latents to choose from.
+        :param features: The actor's features, shape (n, features_dim).
+        :return: For each row of features the latent, and its end point, each (n, action_dim).
+        """
         return densest_endpoints(self.transport, candidates, features)
 
     def draw_endpoints(
@@ -313,6 +328,39 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
 
     def keep_within_bounds(self) -> None:
         """Clamp parameters that have bounds, after a step of the optimizer."""
+
+
+class ContinuousFlowPolicy(FlowPolicy):
+    """A flow policy whose end points are those of a differential equation, of its velocity field.
+
+    Takes the arguments of :class:`FlowPolicy`.
+    """
+
+    def _build_actor(self) -> None:
+        self.velocity = self._make_velocity_field()
+
+    @property
+    @abstractmethod
+    def flow(self) -> Flow:
+        """The flow from latents to end points."""
+
+    @property
+    def n_evaluations_per_action(self) -> int:
+        return self.flow.n_evaluations
+
+    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """End points of the flow, see :meth:`FlowPolicy.transport`."""
+        return self.flow.solve(latents, features)
+
+    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """See :meth:`FlowPolicy.densest`; subclasses with a transport of their own are followed."""
+        if type(self).transport is not ContinuousFlowPolicy.transport:
+            return super().densest(candidates, features)
+        return self.flow.densest(candidates, features)
+
+    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
+        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
+        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
 
 FlowActorCriticPolicy = FlowPolicy

@@ -1,12 +1,18 @@
 """The flow of a policy: a velocity field, an interpolant and a solver as one object."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import torch as th
 
 from sb3_policyflow.flows.interpolants import Interpolant
 from sb3_policyflow.flows.solvers import SOLVERS, solver_times
 from sb3_policyflow.flows.velocity import VelocityField
+
+
+class _Method(TypedDict):
+    solver: str
+    n_steps: int
+    end_time: float
 
 
 class Flow(NamedTuple):
@@ -38,13 +44,23 @@ class Flow(NamedTuple):
         :param features: s, shape (n, features_dim).
         :return: phi, shape (n, dim).
         """
-        return self.velocity.integrate(
-            latents,
-            features,
-            solver=self.solver,
-            n_steps=self.n_steps,
-            end_time=self.interpolant.end_time,
-        )
+        return self.velocity.integrate(latents, features, **self._method())
+
+    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Of some latents, the one whose end point has the most others around it.
+
+        :param candidates: The latents to choose from, shape (k, dim).
+        :param features: s, shape (n, features_dim).
+        :return: For each row of features the latent, and its end point, each of shape (n, dim).
+        """
+        return self.velocity.densest(candidates, features, **self._method())
+
+    def _method(self) -> _Method:
+        return {
+            "solver": self.solver,
+            "n_steps": self.n_steps,
+            "end_time": self.interpolant.end_time,
+        }
 
     def times(self) -> th.Tensor:
         """The solver's time grid on the device of the field (paper: the discrete time grid)."""

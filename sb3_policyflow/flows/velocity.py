@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from numbers import Integral
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ from torch import nn
 
 from sb3_policyflow.flows.choices import choose
 from sb3_policyflow.flows.folding import integrate_folded, is_foldable
+from sb3_policyflow.flows.modes import densest_endpoints
 from sb3_policyflow.flows.solvers import integrate
 
 
@@ -186,6 +188,30 @@ class VelocityField(nn.Module):
             solver=solver,
             end_time=end_time,
         )
+
+    def densest(
+        self,
+        candidates: th.Tensor,
+        features: th.Tensor,
+        *,
+        solver: str,
+        n_steps: int,
+        end_time: float = 1.0,
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Of some latents, the one whose end point has the most others around it.
+
+        >>> field, latents, s = VelocityField(2, 3, [16]), th.randn(16, 2), th.randn(5, 3)
+        >>> chosen, ends = field.densest(latents, s, solver="midpoint", n_steps=4)
+        >>> chosen.shape, ends.shape
+        (torch.Size([5, 2]), torch.Size([5, 2]))
+
+        :param candidates: The latents to choose from, shape (k, dim).
+        :param features: s, shape (n, features_dim).
+        :param solver: As for :meth:`integrate`, and so are the others.
+        :return: For each row of features the latent, and its end point, each of shape (n, dim).
+        """
+        carry = partial(self.integrate, solver=solver, n_steps=n_steps, end_time=end_time)
+        return densest_endpoints(carry, candidates, features)
 
 
 def _hidden_layers(

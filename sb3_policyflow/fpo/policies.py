@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions
-from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.flows import SOLVERS, Flow, MatchingSamples, Rectified, draw_matching
+from sb3_policyflow.common.policies import ContinuousFlowPolicy
+from sb3_policyflow.flows import SOLVERS, Flow, Rectified
 
 
 class FPOOptions(FlowOptions, total=False):
@@ -26,7 +26,7 @@ class NoRecord(NamedTuple):
     """FPO needs no record of how an action was made: its update looks at the action alone."""
 
 
-class FPOPolicy(FlowPolicy):
+class FPOPolicy(ContinuousFlowPolicy):
     """Actor-critic policy that transports Gaussian latents along a flow to the action.
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to a = x_1
@@ -61,9 +61,6 @@ class FPOPolicy(FlowPolicy):
         self.action_noise_std = action_noise_std
         super().__init__(observation_space, action_space, lr_schedule, *args, **kwargs)
 
-    def _build_actor(self) -> None:
-        self.velocity = self._make_velocity_field()
-
     @property
     def flow(self) -> Flow:
         """The flow from latents to actions."""
@@ -72,18 +69,6 @@ class FPOPolicy(FlowPolicy):
     @property
     def latent_scale(self) -> float:
         return 1.0
-
-    @property
-    def n_evaluations_per_action(self) -> int:
-        return self.flow.n_evaluations
-
-    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """End points of the flow, see :meth:`FlowPolicy.transport`."""
-        return self.flow.solve(latents, features)
-
-    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
-        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
-        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.kernels.compiler import note_fallback
-from sb3_policyflow.kernels.flow import FlowPlans
+from sb3_policyflow.kernels.flow import FlowPlan, FlowPlans
 from sb3_policyflow.kernels.inspection import (
     KernelView,
     Layer,
@@ -140,15 +140,45 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
         n_steps: int,
         end_time: float = 1.0,
     ) -> th.Tensor:
-        is_matrix = latents.dim() == 2 and latents.shape[:-1] == features.shape[:-1]
-        if self.has_formula_of_paper and is_matrix and not th.is_grad_enabled():
-            parts = self.parts()
-            if not isinstance(parts, str) and parts.supports(latents, features):
-                plan = self._plans.get(parts, solver, n_steps, end_time)
+        if latents.shape[:-1] == features.shape[:-1]:
+            plan = self._plan(latents, features, solver, n_steps, end_time)
+            if plan is not None:
                 return plan.transport(latents, features)
         return super().integrate(
             latents, features, solver=solver, n_steps=n_steps, end_time=end_time
         )
+
+    def densest(
+        self,
+        candidates: th.Tensor,
+        features: th.Tensor,
+        *,
+        solver: str,
+        n_steps: int,
+        end_time: float = 1.0,
+    ) -> tuple[th.Tensor, th.Tensor]:
+        plan = self._plan(candidates, features, solver, n_steps, end_time)
+        if plan is not None:
+            return plan.densest(candidates, features)
+        return super().densest(
+            candidates, features, solver=solver, n_steps=n_steps, end_time=end_time
+        )
+
+    def _plan(
+        self,
+        latents: th.Tensor,
+        features: th.Tensor,
+        solver: str,
+        n_steps: int,
+        end_time: float,
+    ) -> FlowPlan | None:
+        """What the kernel for flows takes; None where it cannot work."""
+        are_matrices = latents.dim() == 2 and features.dim() == 2
+        if self.has_formula_of_paper and are_matrices and not th.is_grad_enabled():
+            parts = self.parts()
+            if not isinstance(parts, str) and parts.supports(latents, features):
+                return self._plans.get(parts, solver, n_steps, end_time)
+        return None
 
 
 class Embedding:

@@ -7,10 +7,11 @@ import torch as th
 
 from sb3_policyflow.flows import SOLVERS, Solver
 from sb3_policyflow.flows.folding import split_first_layer
+from sb3_policyflow.flows.modes import FIRST, relative_bandwidth
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
 from sb3_policyflow.flows.velocity import fourier_features
 from sb3_policyflow.kernels.inspection import addresses
-from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Integers, Kernels, Method
+from sb3_policyflow.kernels.layouts import Choice, Floats, FoldedNetwork, Integers, Kernels, Method
 from sb3_policyflow.kernels.threads import in_parts, n_parts
 
 if TYPE_CHECKING:  # that module imports this one
@@ -18,6 +19,8 @@ if TYPE_CHECKING:  # that module imports this one
 
 MAX_PLANS = 8
 """Solvers that a field keeps plans for at the same time."""
+NO_CHOICE = Choice(np.empty((0, 0), dtype=np.float32), np.float32(0), np.float32(0))
+"""For latents that are given."""
 
 
 class FlowPlan(NamedTuple):
@@ -31,14 +34,34 @@ class FlowPlan(NamedTuple):
     def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
         """Carry latents (n, dim) with features (n, features_dim) to their end points (n, dim)."""
         endpoints = th.empty_like(latents)
+        self._run(features, latents, NO_CHOICE, endpoints, self.flops_per_row)
+        return endpoints
+
+    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Choose among candidates (k, dim) with features (n, features_dim), each (n, dim)."""
+        k, dim = candidates.shape
+        chosen, endpoints = (candidates.new_empty(len(features), dim) for _ in range(2))
+        bandwidth = np.float32(relative_bandwidth(k, dim))
+        choice = Choice(chosen.numpy(), bandwidth, np.float32(FIRST))
+        self._run(features, candidates, choice, endpoints, k * self.flops_per_row)
+        return chosen, endpoints
+
+    def _run(
+        self,
+        features: th.Tensor,
+        latents: th.Tensor,
+        choice: Choice,
+        endpoints: th.Tensor,
+        flops_per_row: int,
+    ) -> None:
+        """Call the kernel, on several threads if it pays."""
         network, method, run = self.network, self.method, self.kernels.flow
-        arrays = (features.numpy(), latents.numpy(), endpoints.numpy())
+        arrays = (features.numpy(), latents.numpy(), choice, endpoints.numpy())
         in_parts(
-            len(latents),
-            n_parts(len(latents), self.flops_per_row),
+            len(features),
+            n_parts(len(features), flops_per_row),
             lambda _, start, stop: run(network, method, *arrays, start, stop),
         )
-        return endpoints
 
 
 class FlowPlans:

@@ -193,6 +193,19 @@ clipped, of the ratio, of the divergence, the Brownian regularizer, the change o
 the squared error of the value; ``LARGEST`` is the greatest absolute log ratio."""
 
 
+class Choice(NamedTuple):
+    """How to choose the latent of a row by where it ends, see :mod:`~sb3_policyflow.flows.modes`.
+
+    :param latents: Filled with the chosen ones, shape (n, dim); of no rows if there is no choice.
+    :param bandwidth: Twice the square of the bandwidth, in variances of all end points together.
+    :param first: What the density at the first end point is multiplied by.
+    """
+
+    latents: Floats
+    bandwidth: np.float32
+    first: np.float32
+
+
 class Kernels(Protocol):
     """The functions of :mod:`sb3_policyflow.kernels._numba`, where they are documented."""
 
@@ -249,11 +262,12 @@ class Kernels(Protocol):
         method: Method,
         features: Floats,
         latents: Floats,
+        choice: Choice,
         endpoints: Floats,
         start: int,
         stop: int,
     ) -> None:
-        """Carry some rows of latents to their end points."""
+        """Carry some rows of latents to their end points, or choose a latent for some rows."""
 
     def activation_address(self, kind: int) -> int:
         """Where an activation is in memory."""

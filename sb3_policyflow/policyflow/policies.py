@@ -12,8 +12,8 @@ from torch import nn
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.options import FlowOptions, accepts_former_names
-from sb3_policyflow.common.policies import FlowPolicy as BaseFlowPolicy
-from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow, MatchingSamples, draw_matching
+from sb3_policyflow.common.policies import ContinuousFlowPolicy
+from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
 from sb3_policyflow.flows.bounds import half_ranges
 
 
@@ -56,7 +56,7 @@ def check_latents(policy: "PolicyFlowPolicy") -> None:
         )
 
 
-class PolicyFlowPolicy(BaseFlowPolicy):
+class PolicyFlowPolicy(ContinuousFlowPolicy):
     """Actor-critic policy that transports Gaussian latents along a flow (paper, policy).
 
     z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
@@ -124,7 +124,7 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         self.keep_within_bounds()
 
     def _build_actor(self) -> None:
-        self.velocity = self._make_velocity_field()
+        super()._build_actor()
         assert isinstance(self.action_space, spaces.Box)
         ranges = half_ranges(self.action_space.low, self.action_space.high)
         stds = np.where(np.isfinite(ranges), LATENT_STD * ranges, 1.0)
@@ -150,10 +150,6 @@ class PolicyFlowPolicy(BaseFlowPolicy):
         return Flow(self.velocity, interpolant, self.solver, self.n_flow_steps)
 
     @property
-    def n_evaluations_per_action(self) -> int:
-        return self.flow.n_evaluations
-
-    @property
     def noise_log_std(self) -> th.Tensor:
         """Logarithm of sigma of the Gaussian noise within its bounds, shape (action_dim,)."""
         if self.log_std_bounds is None:
@@ -165,14 +161,6 @@ class PolicyFlowPolicy(BaseFlowPolicy):
             # Beyond its bounds log_std would have no gradient, and never come back.
             with th.no_grad():
                 self.log_std.clamp_(*self.log_std_bounds)
-
-    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """End points phi, see :meth:`FlowPolicy.transport`."""
-        return self.flow.solve(latents, features)
-
-    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
-        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
-        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
     def sample_actions(
         self, features: th.Tensor, deterministic: bool = False

@@ -84,6 +84,42 @@ def test_flow_by_size(dim: int, features_dim: int, widths: list[int], n_rows: in
         close(ours, integrate_plainly(field, z, s, **options))
 
 
+@pytest.mark.parametrize(("dim", "features_dim", "widths"), SHAPES)
+@pytest.mark.parametrize("n_rows", [1, 17])
+@pytest.mark.parametrize("n_candidates", [2, 16, 100])
+def test_choice_of_a_latent(
+    dim: int, features_dim: int, widths: list[int], n_rows: int, n_candidates: int
+) -> None:
+    """Against the formula in float64."""
+    field = make_field(dim, features_dim, widths, nn.Mish)
+    candidates, s = th.randn(n_candidates, dim), 3 * th.randn(n_rows, features_dim)
+    options: dict[str, Any] = {"solver": "midpoint", "n_steps": 4}
+    with th.no_grad():
+        latents, ends = field.densest(candidates, s, **options)
+    plain, expected = plain_copy(field).double(), []
+    for latent, features in zip(latents, s, strict=True):
+        same = features.double().expand(n_candidates, -1)
+        points = integrate_plainly(plain, candidates.double(), same, **options)
+        squared_bandwidth = 0.25 * n_candidates ** (-2 / (dim + 4)) * points.var(0, correction=0)
+        distances = th.cdist(points, points).square()
+        densities = (-distances / (2 * squared_bandwidth.sum())).exp().sum(0)
+        densities[0] *= 1.5
+        best = densities.argmax()
+        assert th.equal(latent, candidates[best])
+        expected.append(points[best].float())
+    th.testing.assert_close(ends, th.stack(expected), rtol=1e-5, atol=1e-6)
+
+
+def test_choice_of_a_latent_for_nobody_and_among_one() -> None:
+    field = make_field(2, 3, [8])
+    options: dict[str, Any] = {"solver": "euler", "n_steps": 2}
+    with th.no_grad():
+        nobody = field.densest(th.randn(4, 2), th.zeros(0, 3), **options)
+        latents, _ = field.densest(th.ones(1, 2), th.zeros(5, 3), **options)
+    assert [part.shape for part in nobody] == [(0, 2), (0, 2)]
+    assert th.equal(latents, th.ones(5, 2))
+
+
 def test_an_action_does_not_depend_on_who_else_acts() -> None:
     """To the last bit, whatever the batch and the number of threads."""
     field = make_field(2, 4, [256, 128, 64], nn.Mish)

@@ -2,11 +2,13 @@
 
 from typing import Any
 
+import numpy as np
+
 from sb3_policyflow.kernels._numba.matrices import accumulate, clear, copy, floats, project
 from sb3_policyflow.kernels._numba.mlp import hidden_layers, total
 from sb3_policyflow.kernels._numba.options import ROWS, F, inner, kernel
 from sb3_policyflow.kernels._numba.views import block, rows, span
-from sb3_policyflow.kernels.layouts import Floats, FoldedNetwork, Method
+from sb3_policyflow.kernels.layouts import Choice, Floats, FoldedNetwork, Method
 
 
 @kernel
@@ -15,32 +17,72 @@ def flow(
     method: Method,
     features: Floats,
     latents: Floats,
+    choice: Choice,
     endpoints: Floats,
     start: int,
     stop: int,
 ) -> None:
-    """Carry some rows of latents to their end points.
+    """Carry some rows of latents to their end points, or choose a latent for some rows.
 
     :param network: The velocity field.
     :param method: The solver.
     :param features: shape (n, n_features).
-    :param latents: shape (n, dim).
+    :param latents: shape (n, dim); those to choose from have the shape (k, dim).
+    :param choice: How to choose, if ``choice.latents`` has any rows.
     :param endpoints: Filled; shape (n, dim).
     :param start: The first row.
     :param stop: The row behind the last.
     """
-    width, dim, n_values = network.widths[0], latents.shape[1], total(network.widths)
-    most = min(ROWS, stop - start)
+    width, (n_latents, dim), n_values = network.widths[0], latents.shape, total(network.widths)
+    chooses = choice.latents.shape[0] > 0
+    step = 1 if chooses else ROWS
+    most = n_latents if chooses else min(ROWS, stop - start)
     values, shifts = floats(most * n_values), floats(most * width)
     stages, scratch = floats(method.time_indices.shape[1] * most * dim), floats(2 * most * dim)
-    for begin in range(start, stop, ROWS):
-        end = min(begin + ROWS, stop)
-        shifts_block = block(shifts, 0, end - begin, width)
+    space, densities = floats(most * dim), floats(most)
+    for begin in range(start, stop, step):
+        end = min(begin + step, stop)
+        n_points = n_latents if chooses else end - begin
+        shifts_block = block(shifts, 0, n_points, width)
         clear(shifts_block)
-        accumulate(rows(features, begin, end), network.features, shifts_block)
-        points = rows(endpoints, begin, end)
-        copy(span(rows(latents, begin, end), 0, points.size), span(points, 0, points.size))
+        accumulate(rows(features, begin, end), network.features, rows(shifts_block, 0, end - begin))
+        for row in range(end - begin, n_points):
+            copy(shifts_block[0], shifts_block[row])
+        points, size = block(space, 0, n_points, dim), n_points * dim
+        copy(span(latents, 0 if chooses else begin * dim, size), space)
         _integrate(network, method, shifts_block, points, values, stages, scratch)
+        if chooses:
+            chosen = _densest(points, choice, densities)
+            copy(latents[chosen], choice.latents[begin])
+            copy(points[chosen], endpoints[begin])
+        else:
+            copy(span(space, 0, size), span(endpoints, begin * dim, size))
+
+
+@inner
+def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
+    """The point around which the others lie most densely; densities are space."""
+    n_points, dim = points.shape
+    variance = F(0.0)
+    for column in range(dim):
+        mean = F(0.0)
+        for i in range(n_points):
+            mean += points[i, column]
+        mean /= F(n_points)
+        for i in range(n_points):
+            variance += (points[i, column] - mean) ** 2
+    scale = max(variance / F(n_points) * choice.bandwidth, np.finfo(F).tiny)
+    for i in range(n_points):
+        densities[i] = F(1.0)
+        for j in range(i):
+            distance = F(0.0)
+            for column in range(dim):
+                distance += (points[i, column] - points[j, column]) ** 2
+            density = np.exp(-distance / scale)
+            densities[i] += density
+            densities[j] += density
+    densities[0] *= choice.first
+    return int(np.argmax(densities))
 
 
 @inner
