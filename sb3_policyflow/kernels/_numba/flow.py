@@ -71,7 +71,9 @@ def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
         mean /= F(n_points)
         for i in range(n_points):
             variance += (points[i, column] - mean) ** 2
-    scale = max(variance / F(n_points) * choice.bandwidth, np.finfo(F).tiny)
+    scale = variance / F(n_points) * choice.bandwidth
+    if scale == F(0.0):
+        scale = F(1.0)  # all points are the same
     for i in range(n_points):
         densities[i] = F(1.0)
         for j in range(i):
@@ -82,7 +84,11 @@ def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
             densities[i] += density
             densities[j] += density
     densities[0] *= choice.first
-    return int(np.argmax(densities))
+    chosen = 0
+    for i in range(1, n_points):
+        if densities[i] > densities[chosen]:
+            chosen = i
+    return chosen
 
 
 @inner
