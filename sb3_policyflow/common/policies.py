@@ -258,7 +258,10 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         if not deterministic or choice == "drawn":
             size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
             return scale * th.randn(size, device=features.device, dtype=features.dtype), None
-        candidates = scale * candidate_latents(self.action_dim).to(features)
+        if isinstance(scale, float):
+            candidates = candidate_latents(self.action_dim, scale).to(features)
+        else:
+            candidates = scale * candidate_latents(self.action_dim).to(features)
         return self.densest(candidates, features)
 
     def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -1,7 +1,7 @@
 """The mode of a flow's end points, estimated from a few of them."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 import torch as th
@@ -69,19 +69,20 @@ def densest_endpoints(
     return latents[chosen], endpoints[rows, chosen]
 
 
-def candidate_latents(dim: int) -> th.Tensor:
-    """Fixed latents to choose the deterministic action from: 0, and draws from N(0, I).
+def candidate_latents(dim: int, scale: float = 1.0) -> th.Tensor:
+    """Fixed latents to choose the deterministic action from: 0, and draws from N(0, scale^2 I).
 
     :param dim: Dimensions of the action.
+    :param scale: Standard deviation of the latents.
     :return: Shape (N_CANDIDATES, dim), float32 on the CPU; the same in every process.
     """
     # What is cached is no tensor: one that is made while a policy is exported has no values.
-    return th.from_numpy(_candidates(dim))
+    return th.from_numpy(_candidates(dim, scale))
 
 
-@cache
-def _candidates(dim: int) -> NDArray[np.float32]:
+@lru_cache
+def _candidates(dim: int, scale: float) -> NDArray[np.float32]:
     # This generator's numbers will not change in later versions of NumPy.
     draws = np.random.RandomState(0).standard_normal((N_CANDIDATES, dim))
     draws[0] = 0.0
-    return draws.astype(np.float32)
+    return draws.astype(np.float32) * np.float32(scale)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # that module imports this one
 
 MAX_PLANS = 8
 """Solvers that a field keeps plans for at the same time."""
-NO_CHOICE = Choice(np.empty((0, 0), dtype=np.float32), np.float32(0), np.float32(0))
+NO_CHOICE = Choice(np.empty((0, 0), dtype=np.float32), 0.0, 0.0)
 """For latents that are given."""
 
 
@@ -40,9 +40,9 @@ class FlowPlan(NamedTuple):
     def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Choose among candidates (k, dim) with features (n, features_dim), each (n, dim)."""
         k, dim = candidates.shape
-        chosen, endpoints = (candidates.new_empty(len(features), dim) for _ in range(2))
-        bandwidth = np.float32(relative_bandwidth(k, dim))
-        choice = Choice(chosen.numpy(), bandwidth, np.float32(FIRST))
+        shape = features.shape[0], dim
+        chosen, endpoints = candidates.new_empty(shape), candidates.new_empty(shape)
+        choice = Choice(chosen.numpy(), relative_bandwidth(k, dim), FIRST)
         self._run(features, candidates, choice, endpoints, k * self.flops_per_row)
         return chosen, endpoints
 

@@ -216,11 +216,13 @@ def are_in_mode(module: nn.Module, training: bool) -> bool:
     :param module: The module.
     :param training: The mode that is asked for.
     """
-    modules = [module]
-    for part in modules:  # grows; much faster than Module.modules()
-        if part.training is not training:
-            return False
-        modules += [child for child in part._modules.values() if child is not None]
+    parts: list[nn.Module | None] = [module]
+    for part in parts:  # grows; much faster than Module.modules()
+        if part is not None:
+            if part.training is not training:
+                return False
+            if part._modules:
+                parts += part._modules.values()
     return True
 
 

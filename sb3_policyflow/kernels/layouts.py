@@ -202,8 +202,8 @@ class Choice(NamedTuple):
     """
 
     latents: Floats
-    bandwidth: np.float32
-    first: np.float32
+    bandwidth: float
+    first: float
 
 
 class Kernels(Protocol):

@@ -71,7 +71,7 @@ def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
         mean /= F(n_points)
         for i in range(n_points):
             variance += (points[i, column] - mean) ** 2
-    scale = variance / F(n_points) * choice.bandwidth
+    scale = variance / F(n_points) * F(choice.bandwidth)
     if scale == F(0.0):
         scale = F(1.0)  # all points are the same
     for i in range(n_points):
@@ -83,7 +83,7 @@ def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
             density = np.exp(-distance / scale)
             densities[i] += density
             densities[j] += density
-    densities[0] *= choice.first
+    densities[0] *= F(choice.first)
     chosen = 0
     for i in range(1, n_points):
         if densities[i] > densities[chosen]:
