@@ -62,33 +62,44 @@ def flow(
 @inner
 def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
     """The point around which the others lie most densely; densities are space."""
+    scale = _mean_square(points) * F(choice.bandwidth)
+    if scale == F(0.0):
+        return 0  # all points are the same
+    for i in range(points.shape[0]):
+        densities[i] = F(1.0)
+        for j in range(i):
+            density = np.exp(-_squared_distance(points[i], points[j]) / scale)
+            densities[i] += density
+            densities[j] += density
+    densities[0] *= F(choice.first)
+    chosen = 0
+    for i in range(1, points.shape[0]):
+        if densities[i] > densities[chosen]:
+            chosen = i
+    return chosen
+
+
+@inner
+def _mean_square(points: Floats) -> Any:
+    """The mean square of the distances from the mean."""
     n_points, dim = points.shape
-    variance = F(0.0)
+    squares = F(0.0)
     for column in range(dim):
         mean = F(0.0)
         for i in range(n_points):
             mean += points[i, column]
         mean /= F(n_points)
         for i in range(n_points):
-            variance += (points[i, column] - mean) ** 2
-    scale = variance / F(n_points) * F(choice.bandwidth)
-    if scale == F(0.0):
-        scale = F(1.0)  # all points are the same
-    for i in range(n_points):
-        densities[i] = F(1.0)
-        for j in range(i):
-            distance = F(0.0)
-            for column in range(dim):
-                distance += (points[i, column] - points[j, column]) ** 2
-            density = np.exp(-distance / scale)
-            densities[i] += density
-            densities[j] += density
-    densities[0] *= F(choice.first)
-    chosen = 0
-    for i in range(1, n_points):
-        if densities[i] > densities[chosen]:
-            chosen = i
-    return chosen
+            squares += (points[i, column] - mean) ** 2
+    return squares / F(n_points)
+
+
+@inner
+def _squared_distance(x: Floats, y: Floats) -> Any:
+    result = F(0.0)
+    for column in range(x.size):
+        result += (x[column] - y[column]) ** 2
+    return result
 
 
 @inner
