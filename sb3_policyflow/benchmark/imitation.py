@@ -1,16 +1,18 @@
-"""MultiGoal from demonstrations: cloned, then trained further, by four algorithms.
+"""Tasks with several goals from demonstrations: cloned, then trained further.
 
-Demonstrators go to all six goals, a good one and a slow one. Each algorithm starts from its own
-clone. Makes the demonstrations, trains what is missing, with every seed; draws the first seed's
-trajectories before and after to ``imitation.png`` and writes the table of all seeds to
-``imitation.md``.
+Demonstrators go to all goals: of MultiGoal a good one and a slow one, of the maze a good one. Each
+algorithm starts from its own clone. Makes the demonstrations, trains what is missing, with every
+seed, and writes the table of all seeds to ``TASK.md``; of MultiGoal it also draws the first seed's
+trajectories before and after, to ``multigoal.png``.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -18,143 +20,202 @@ from sb3_policyflow.benchmark.report.statistics import over_seeds
 from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
 from sb3_policyflow.benchmark.results import Result, Run, distinct, load_results
 from sb3_policyflow.benchmark.run import add_running_arguments, run_and_report
+from sb3_policyflow.envs import point_maze
 from sb3_policyflow.imitation.demonstrators import demonstrate, make_env
 from sb3_policyflow.imitation.episodes import save_episodes
 
-HEADER = (
-    "demonstrations",
-    "algorithm",
-    "seeds",
-    "steps",
-    "return cloned",
-    "return trained",
-    "center cloned",
-    "center trained",
-    "goals cloned",
-    "goals trained",
-    "entropy cloned",
-    "entropy trained",
+Hyperparams = Mapping[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task with demonstrators that go to all of its goals.
+
+    :param env: Id of the environment.
+    :param n_demonstrations: Episodes of each demonstrator.
+    :param n_trajectories: Episodes from one start, of which the goals are counted.
+    :param steps: Environment steps of the training, by demonstrator.
+    :param algorithms: What differs from the YAML files, by algorithm.
+    :param of_policyflow: And of PolicyFlow, by demonstrator.
+    """
+
+    env: str
+    n_demonstrations: int
+    n_trajectories: int
+    steps: Mapping[str, float]
+    algorithms: Hyperparams
+    of_policyflow: Hyperparams = field(default_factory=dict)
+
+
+MULTI_GOAL = Task(
+    env=ENV,
+    # Few of them pass the center, where the choice of a goal is learned.
+    n_demonstrations=16_384,
+    n_trajectories=N_TRAJECTORIES,
+    steps={"good": 1e6, "slow": 5e6},
+    algorithms={
+        # Values of up to 10 are not clipped by 100.
+        "policyflow": ROLLOUTS
+        | {
+            "desired_kl": None,
+            "lr_adaptation_kwargs": None,
+            "ent_coef": 0.0,
+            "clip_range_vf": 100.0,
+            "policy_kwargs": "dict(net_arch=[256, 128, 64], activation_fn=nn.Mish, "
+            "embedding_dim=64)",
+        },
+        "fpo": ROLLOUTS,
+        "dppo": ROLLOUTS,
+        "ppo": ROLLOUTS | {"policy_kwargs": "dict(net_arch=[256, 128, 64], activation_fn=nn.Mish)"},
+    },
+    # The noise explores, and from good demonstrations there is little to find. What is nearly
+    # optimal has small advantages, which normalization would make large: goals are lost.
+    of_policyflow={
+        "good": {
+            "learning_rate": "lin_5e-5",
+            "normalize_advantage": False,
+            "brownian_coef": 0.05,
+            "imitation_kwargs": {"noise_std": 0.3},
+        },
+        "slow": {
+            "learning_rate": 3e-4,
+            "brownian_coef": 0.05,
+            "imitation_kwargs": {"noise_std": 0.5},
+        },
+    },
 )
-N_EPISODES = 16_384
-"""Of each demonstrator: few of them pass the center, where the choice of a goal is learned."""
-STEPS = {"good": 1e6, "slow": 5e6}
-"""Environment steps of the training, by demonstrator."""
-
-ALGORITHMS: dict[str, dict[str, Any]] = {
-    "policyflow": {
-        "desired_kl": None,
-        "lr_adaptation_kwargs": None,
-        "ent_coef": 0.0,
-        "clip_range_vf": 100.0,
-        "policy_kwargs": "dict(net_arch=[256, 128, 64], activation_fn=nn.Mish, embedding_dim=64)",
-    },
-    "fpo": {},
-    "dppo": {},
-    "ppo": {"policy_kwargs": "dict(net_arch=[256, 128, 64], activation_fn=nn.Mish)"},
-}
-"""What differs from the YAML files, by algorithm. Values of up to 10 are not clipped by 100."""
-OF_POLICYFLOW: dict[str, dict[str, Any]] = {
-    "good": {
-        "learning_rate": "lin_5e-5",
-        "normalize_advantage": False,
-        "brownian_coef": 0.05,
-        "imitation_kwargs": {"noise_std": 0.3},
-    },
-    "slow": {"learning_rate": 3e-4, "brownian_coef": 0.05, "imitation_kwargs": {"noise_std": 0.5}},
-}
-"""And by demonstrator. The noise explores, and from good demonstrations there is little to find.
-
-What is nearly optimal has small advantages, which normalization would make large: goals are lost.
-"""
+POINT_MAZE = Task(
+    env=point_maze.ENV_ID,
+    n_demonstrations=200,
+    n_trajectories=200,
+    steps={"good": 2e6},
+    algorithms={"policyflow": {"brownian_coef": 0.05}, "ppo": {}},
+    of_policyflow={"good": {"imitation_kwargs": {"noise_std": 0.3}}},
+)
+TASKS = {"multigoal": MULTI_GOAL, "pointmaze": POINT_MAZE}
 
 
-def hyperparams(style: str, algo: str, folder: Path) -> dict[str, Any]:
+def hyperparams(task: Task, style: str, algo: str, folder: Path) -> dict[str, Any]:
     """What differs from the YAML file of an algorithm.
 
+    :param task: What is learned.
     :param style: The demonstrator.
     :param algo: The algorithm.
     :param folder: Where the demonstrations are.
     """
-    chosen = {**ROLLOUTS, **ALGORITHMS[algo], "demonstrations": str(demonstrations(style, folder))}
+    chosen = {**task.algorithms[algo], "demonstrations": str(demonstrations(task, style, folder))}
     if algo != "ppo":
         chosen["n_critic_warmup"] = 12
     if algo == "policyflow":
-        chosen |= OF_POLICYFLOW[style]
+        chosen |= task.of_policyflow.get(style, {})
     return chosen
 
 
-def demonstrations(style: str, folder: Path) -> Path:
+def demonstrations(task: Task, style: str, folder: Path) -> Path:
     """The file of a demonstrator."""
-    return folder / "demonstrations" / f"{style}.npz"
+    name = style if task is MULTI_GOAL else f"{task.env}-{style}"
+    return folder / "demonstrations" / f"{name}.npz"
 
 
-def make_demonstrations(style: str, folder: Path, n_episodes: int = N_EPISODES) -> None:
+def make_demonstrations(
+    task: Task, style: str, folder: Path, n_episodes: int | None = None
+) -> None:
     """Make a demonstrator's file, unless it is there."""
-    path = demonstrations(style, folder)
+    path = demonstrations(task, style, folder)
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_episodes(demonstrate(ENV, style, n_episodes), path, make_env(ENV, 1, 0))
+        episodes = demonstrate(task.env, style, n_episodes or task.n_demonstrations)
+        save_episodes(episodes, path, make_env(task.env, 1, 0))
 
 
 def runs(arguments: argparse.Namespace) -> list[Run]:
     """The trainings that are wanted, seed after seed."""
+    task = TASKS[arguments.task]
     return [
         Run(
             f"{style}-{algo}",
             algo,
-            ENV,
+            task.env,
             seed,
-            int(arguments.steps or STEPS[style]),
-            hyperparams(style, algo, arguments.out),
+            int(arguments.steps or task.steps[style]),
+            hyperparams(task, style, algo, arguments.out),
             n_evaluations=arguments.evaluations,
             n_episodes=arguments.episodes,
-            n_trajectories=N_TRAJECTORIES,
+            n_trajectories=task.n_trajectories,
         )
         for seed in arguments.seeds
-        for style in arguments.styles
-        for algo in arguments.algos
+        for style in chosen_styles(arguments)
+        for algo in arguments.algos or task.algorithms
     ]
+
+
+def chosen_styles(arguments: argparse.Namespace) -> Sequence[str]:
+    """The demonstrators that are asked for."""
+    return arguments.styles or list(TASKS[arguments.task].steps)
+
+
+HEADER = ("demonstrations", "algorithm", "seeds", "steps")
+QUANTITIES = {
+    "return": ".2f",
+    "return from one start": ".2f",
+    "goals": ".2g",
+    "entropy": ".2f",
+    "no goal, %": ".1f",
+}
+"""Columns of the table, each before and after the training, with the digits that they have."""
 
 
 def imitation_table(results: Sequence[Result]) -> str:
     """A row for each demonstrator and algorithm."""
+    columns = [f"{name}: {stage}" for name in QUANTITIES for stage in ("cloned", "trained")]
     rows = [
         _row(name, [result for result in results if result.run.name == name])
         for name in distinct(results, "name")
     ]
-    return f"{markdown_table(HEADER, rows)}\n\n{seeds_caption(results)}\n"
-
-
-QUANTITIES = {"return": ".2f", "mean_return": ".2f", "n_goals": ".2g", "entropy": ".2f"}
-"""Columns of the table, each before and after the training, with the digits that they have."""
+    return f"{markdown_table([*HEADER, *columns], rows)}\n\n{seeds_caption(results)}\n"
 
 
 def _row(name: str, results: Sequence[Result]) -> list[str]:
     style, algo = name.split("-")
-    row = [style, algo, str(len(results)), steps_trained(results)]
-    stages = [
-        [
-            {"return": evaluation["mean_return"], **goals}
-            for evaluation, goals in (_stage(result.summary, is_trained) for result in results)
-        ]
-        for is_trained in (False, True)
+    before, after = (
+        [_quantities(result, is_trained) for result in results] for is_trained in (False, True)
+    )
+    numbers = [
+        over_seeds([each[quantity] for each in stage]).format(digits)
+        for quantity, digits in QUANTITIES.items()
+        for stage in (before, after)
     ]
-    for quantity, digits in QUANTITIES.items():
-        for stage in stages:
-            values = [float(each[quantity]) for each in stage]
-            row.append(over_seeds(values).format(digits))
-    return row
+    return [style, algo, str(len(results)), steps_trained(results), *numbers]
 
 
-def _stage(summary: dict[str, Any], is_trained: bool) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The evaluation from random starts, and the goals from the center, before or after."""
-    if is_trained:
-        return summary["final"]["stochastic"], summary["goals"]
-    return summary["cloned"], summary["cloned"]["goals"]
+def _quantities(result: Result, is_trained: bool) -> dict[str, float]:
+    """What the table says of a run, before or after its training."""
+    summary = result.summary
+    evaluation = summary["final"]["stochastic"] if is_trained else summary["cloned"]
+    goals = summary["goals"] if is_trained else summary["cloned"]["goals"]
+    n_missed = goals["n_missed"]
+    values = (
+        evaluation["mean_return"],
+        goals["mean_return"],
+        goals["n_goals"],
+        goals["entropy"],
+        100 * n_missed / (n_missed + sum(goals["counts"])),
+    )
+    return dict(zip(QUANTITIES, map(float, values), strict=True))
 
 
 def draw(folder: Path, results: Sequence[Result]) -> None:
-    """Write the figure of each variant's first seed, and the table of all."""
+    """Write the table of each task that has been run, and MultiGoal's figure."""
+    for name, task in TASKS.items():
+        own = [result for result in results if result.run.env == task.env]
+        if own:
+            (folder / f"{name}.md").write_text(imitation_table(own), encoding="utf-8")
+        if own and task is MULTI_GOAL:
+            _draw_trajectories(folder, own)
+
+
+def _draw_trajectories(folder: Path, results: Sequence[Result]) -> None:
+    """MultiGoal's figure, of each variant's first seed."""
     first = {result.run.name: result.run for result in reversed(results)}
     trajectories = {}
     for name in distinct(results, "name"):
@@ -162,26 +223,48 @@ def draw(folder: Path, results: Sequence[Result]) -> None:
         title = f"{algo} from {style} demonstrations"
         trajectories[f"{title}: cloned"] = load_trajectories(first[name], folder, "-cloned.npz")
         trajectories[f"{title}: trained"] = load_trajectories(first[name], folder)
-    goals_figure(trajectories, n_columns=4).savefig(folder / "imitation.png")
-    (folder / "imitation.md").write_text(imitation_table(results), encoding="utf-8")
+    goals_figure(trajectories, n_columns=4).savefig(folder / "multigoal.png")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("--styles", nargs="+", choices=STEPS, default=list(STEPS))
-    parser.add_argument("--algos", nargs="+", choices=ALGORITHMS, default=list(ALGORITHMS))
+    parser.add_argument("--task", choices=TASKS, default="multigoal", help="default: multigoal")
+    parser.add_argument("--styles", nargs="+", choices=MULTI_GOAL.steps, help="default: all")
+    parser.add_argument("--algos", nargs="+", choices=MULTI_GOAL.algorithms, help="default: all")
     parser.add_argument(
-        "--steps", type=float, help="environment steps of each; default: 1e6 (good), 5e6 (slow)"
+        "--steps",
+        type=float,
+        help="environment steps of each; default: 1e6 (good), 5e6 (slow), 2e6 (pointmaze)",
     )
     add_running_arguments(parser, Path("docs/results/imitation"))
     parser.set_defaults(episodes=200, evaluations=5)
 
 
 def main(arguments: argparse.Namespace) -> int:
-    """Make the demonstrations, train what is missing and make figure and table."""
-    for style in arguments.styles:
-        make_demonstrations(style, arguments.out)
+    """Make the demonstrations, train what is missing and make figure and tables."""
+    task = TASKS[arguments.task]
+    check_choices(arguments)
+    require_env(task.env)
+    for style in chosen_styles(arguments):
+        make_demonstrations(task, style, arguments.out)
     code = run_and_report(runs(arguments), arguments)
     draw(arguments.out, load_results(arguments.out))
-    print(f"Wrote {arguments.out / 'imitation.png'} and {arguments.out / 'imitation.md'}.")
+    print(f"The tables are in {arguments.out}.")
     return code
+
+
+def check_choices(arguments: argparse.Namespace) -> None:
+    """Refuse demonstrators and algorithms that a task does not have.
+
+    :raises BenchmarkError: With those that it has.
+    """
+    task = TASKS[arguments.task]
+    for option, asked, there in (
+        ("--styles", arguments.styles, task.steps),
+        ("--algos", arguments.algos, task.algorithms),
+    ):
+        unknown = [name for name in asked or [] if name not in there]
+        if unknown:
+            raise BenchmarkError(
+                f"{option} {' '.join(unknown)}: the task {arguments.task} has {', '.join(there)}."
+            )

@@ -34,7 +34,8 @@ class Run:
     :param hyperparams: What differs from the YAML file.
     :param n_evaluations: Evaluations, evenly over the training, the last one at its end.
     :param n_episodes: Episodes of an evaluation, in each mode.
-    :param n_trajectories: MultiGoal episodes from the center to keep; 0 for none.
+    :param n_trajectories: Episodes from one start, of which the goals are counted, and which
+        MultiGoal keeps; 0 for none.
     :param keep_visits: Whether to count where in the medium maze the training goes.
     """
 

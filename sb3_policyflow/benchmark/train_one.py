@@ -16,10 +16,12 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.costs import GradientSteps, network_evaluations
 from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC, EvaluationCallback, evaluate
-from sb3_policyflow.benchmark.measure.goals import goal_report, sample_trajectories
+from sb3_policyflow.benchmark.measure.goals import GoalReport, goal_report, sample_trajectories
+from sb3_policyflow.benchmark.measure.maze_goals import evaluate_maze_goals
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.measure.visits import VisitCounter
 from sb3_policyflow.benchmark.results import PROGRESS, Result, Run
+from sb3_policyflow.envs.point_maze import ENV_ID as MAZE
 
 N_EVALUATION_ENVS = 10
 
@@ -58,12 +60,12 @@ def train_one(run: Run, folder: Path) -> Result:
         }
         if "demonstrations" in run.hyperparams and run.n_trajectories:
             summary["cloned"] = evaluate(model, env, STOCHASTIC, run.n_episodes)
-            summary["cloned"]["goals"] = _keep_trajectories(model, run, folder, "-cloned.npz")
+            summary["cloned"]["goals"] = _goals(model, run, folder, "-cloned.npz")
         summary |= train_and_measure(model, run.steps, evaluations, callbacks)
         for counter in counters:
             counter.visits().save(_archive(run, folder, ".npz"))
         if run.n_trajectories:
-            summary["goals"] = _keep_trajectories(model, run, folder, ".npz")
+            summary["goals"] = _goals(model, run, folder, ".npz")
         env.close()
         manager_env = model.get_env()
         assert manager_env is not None
@@ -125,19 +127,25 @@ def _archive(run: Run, folder: Path, suffix: str) -> Path:
     return path
 
 
-def _keep_trajectories(
-    model: OnPolicyAlgorithm, run: Run, folder: Path, suffix: str
-) -> dict[str, Any]:
-    """Run episodes from the center of MultiGoal, keep them, and say which goals they reached."""
+def _goals(model: OnPolicyAlgorithm, run: Run, folder: Path, suffix: str) -> dict[str, Any]:
+    """Run episodes from one start, and say which goals they reached; MultiGoal's are kept."""
+    if run.env == MAZE:
+        report = evaluate_maze_goals(model, run.n_trajectories)
+    else:
+        report = _keep_trajectories(model, run, folder, suffix)
+    return {**asdict(report), "n_goals": report.n_goals}
+
+
+def _keep_trajectories(model: OnPolicyAlgorithm, run: Run, folder: Path, suffix: str) -> GoalReport:
+    """Run episodes from the center of MultiGoal, and keep them."""
     trajectories = sample_trajectories(model, run.n_trajectories)
-    report = goal_report(trajectories)
     np.savez_compressed(
         _archive(run, folder, suffix),
         positions=trajectories.positions.astype(np.float16),
         lengths=trajectories.lengths.astype(np.int16),
         returns=trajectories.returns.astype(np.float32),
     )
-    return {**asdict(report), "n_goals": report.n_goals}
+    return goal_report(trajectories)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

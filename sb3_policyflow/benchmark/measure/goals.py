@@ -61,7 +61,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """What ``n`` episodes from the center came to.
+    """What ``n`` episodes from one start came to, of MultiGoal from the center.
 
     :param counts: Episodes that ended at each goal.
     :param n_missed: Episodes that ended at none.
@@ -109,7 +109,7 @@ def sample_trajectories(
     """
     env = MultiGoalVecEnv(n, seed=seed)
     env.set_options({"position": CENTER})
-    normalize = _normalizer(model)
+    normalize = normalizer(model)
 
     def act(observations: NDArray[np.float32]) -> NDArray[np.float32]:
         actions: NDArray[np.float32] = model.predict(
@@ -144,7 +144,8 @@ def _run_episodes(
     return Trajectories(positions, lengths, returns)
 
 
-def _normalizer(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+def normalizer(model: PolicyPredictor) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """What a model's observations go through before it sees them."""
     vec_normalize: VecNormalize | None = getattr(model, "get_vec_normalize_env", lambda: None)()
     if vec_normalize is None:
         return lambda observations: observations
@@ -159,12 +160,20 @@ def goal_counts(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> N
 
 def goal_report(trajectories: Trajectories, radius: float = SUCCESS_RADIUS) -> GoalReport:
     """Sum up episodes by the goals they ended at."""
-    counts = goal_counts(trajectories, radius)
+    return report_of(goal_counts(trajectories, radius), trajectories.returns)
+
+
+def report_of(counts: NDArray[np.int_], returns: NDArray[np.float64]) -> GoalReport:
+    """Sum up episodes of any task.
+
+    :param counts: How many of them ended at each goal.
+    :param returns: Their sums of rewards.
+    """
     return GoalReport(
         counts=tuple(counts.tolist()),
-        n_missed=len(trajectories.lengths) - int(counts.sum()),
+        n_missed=len(returns) - int(counts.sum()),
         entropy=normalized_entropy(counts),
-        mean_return=float(trajectories.returns.mean()),
+        mean_return=float(returns.mean()),
     )
 
 
