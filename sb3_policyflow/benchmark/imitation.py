@@ -35,7 +35,8 @@ class Task:
     :param n_demonstrations: Episodes of each demonstrator.
     :param n_trajectories: Episodes from one start, of which the goals are counted.
     :param steps: Environment steps of the training, by demonstrator.
-    :param algorithms: What differs from the YAML files, by algorithm.
+    :param algorithms: What differs from the YAML files, by algorithm and what follows "_":
+        "dppo_last" trains the last half of DPPO's denoising steps.
     :param of_policyflow: And of PolicyFlow, by demonstrator.
     """
 
@@ -66,6 +67,7 @@ MULTI_GOAL = Task(
         },
         "fpo": ROLLOUTS,
         "dppo": ROLLOUTS,
+        "dppo_last": ROLLOUTS | {"n_finetuned_steps": 6},
         "ppo": ROLLOUTS | {"policy_kwargs": "dict(net_arch=[256, 128, 64], activation_fn=nn.Mish)"},
     },
     # The noise explores, and from good demonstrations there is little to find. What is nearly
@@ -134,7 +136,7 @@ def runs(arguments: argparse.Namespace) -> list[Run]:
     return [
         Run(
             f"{style}-{algo}",
-            algo,
+            algo.partition("_")[0],
             task.env,
             seed,
             int(arguments.steps or task.steps[style]),

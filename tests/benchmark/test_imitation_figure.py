@@ -15,7 +15,7 @@ from sb3_policyflow.benchmark import imitation
 from sb3_policyflow.benchmark.results import load_results
 from sb3_policyflow.benchmark.train_one import train_one
 
-ALGORITHMS = ("policyflow", "fpo", "dppo", "ppo")
+ALGORITHMS = ("policyflow", "fpo", "dppo", "dppo_last", "ppo")
 FAST = {"n_envs": 8, "n_steps": 8, "batch_size": 64, "n_epochs": 1}
 CLONING = {"gradient_steps": 20, "batch_size": 64, "eval_freq": 10}
 
