@@ -10,14 +10,13 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from torch import distributed as dist
 from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
 from sb3_policyflow.distributed.ranks import RankError, Ranks
-from sb3_policyflow.distributed.shared_memory import SharedSum, share_memory
+from sb3_policyflow.distributed.shared_memory import SharedSum, can_be_shared, share_memory
 
 T = TypeVar("T")
 UPDATE_TIMEOUT = timedelta(minutes=10)
@@ -121,7 +120,7 @@ class ProcessGroup(Ranks):
     # What an update needs
 
     def mean(self, value: th.Tensor) -> float:
-        return self._sum(value.detach().clone()).item() / self.size
+        return self.sum(value.detach()).item() / self.size
 
     def mean_std(self, values: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         # Chan's formula for the moments of a union, from those of its parts
@@ -136,19 +135,16 @@ class ProcessGroup(Ranks):
     def average_gradients(self, parameters: Iterable[th.nn.Parameter], loss: float) -> float:
         gradients = [p.grad for p in parameters if p.grad is not None]
         own_loss = gradients[0].new_zeros(self.size)
-        own_loss[self.rank] = loss
-        flat = self._sum(th.cat([*(gradient.reshape(-1) for gradient in gradients), own_loss]))
-        losses = flat[-self.size :].tolist()
+        own_loss[self.rank] = self.size * loss
+        self._sum([*gradients, own_loss], divisor=self.size)
+        losses = own_loss.tolist()
         for rank, one in enumerate(losses):
             if not math.isfinite(one):
                 raise FloatingPointError(
                     f"The loss of rank {rank} is not finite (loss {one}). The parameters are "
                     "those of the last good step and can be saved: lower the learning rate."
                 )
-        flat /= self.size
-        parts = th.split(flat, [gradient.numel() for gradient in gradients] + [self.size])
-        th._foreach_copy_(gradients, [p.view_as(g) for p, g in zip(parts, gradients, strict=False)])
-        return float(np.mean(losses))
+        return math.fsum(losses) / self.size
 
     def average_metrics(self, metrics: Mapping[str, float]) -> dict[str, float]:
         rows = self._table(th.tensor(list(metrics.values()), dtype=th.float64, device="cpu"))
@@ -184,24 +180,37 @@ class ProcessGroup(Ranks):
 
     def sum(self, values: th.Tensor) -> th.Tensor:
         """The sum of the ranks' tensors, on the CPU."""
-        return self._sum(values.clone())
+        total = values.clone()
+        self._sum([total])
+        return total
 
     def _table(self, row: th.Tensor) -> th.Tensor:
         """Every rank's row (n,), as a tensor (size, n)."""
         table = row.new_zeros(self.size, len(row))
         table[self.rank] = row
-        return self._sum(table)
+        self._sum([table])
+        return table
 
-    def _sum(self, values: th.Tensor) -> th.Tensor:
-        """The sum of the ranks' tensors in place; to the last bit the same on each."""
+    def _sum(self, tensors: list[th.Tensor], divisor: int = 1) -> None:
+        """Replace tensors by their sums over the ranks, to the last bit the same on each.
+
+        :param tensors: The tensors, of floating-point numbers unless the divisor is 1.
+        :param divisor: What the sums are divided by.
+        """
         with self._answered():
-            shared = self._shared(values.nbytes) if values.device.type == "cpu" else None
-            if shared is not None:
-                shared.add(values)
-            else:
-                takes_cpu = values.is_cuda or dist.get_backend() != "nccl"
-                dist.all_reduce(values, group=None if takes_cpu else self._control)
-        return values
+            if can_be_shared(tensors):
+                shared = self._shared(sum(tensor.nbytes for tensor in tensors))
+                if shared is not None:
+                    shared.add(tensors, divisor)
+                    return
+            flat = th.cat([tensor.reshape(-1) for tensor in tensors])
+            takes_cpu = flat.is_cuda or dist.get_backend() != "nccl"
+            dist.all_reduce(flat, group=None if takes_cpu else self._control)
+            if divisor != 1:
+                flat /= divisor
+            parts = th.split(flat, [tensor.numel() for tensor in tensors])
+            sums = [part.view_as(tensor) for part, tensor in zip(parts, tensors, strict=True)]
+            th._foreach_copy_(tensors, sums)
 
     def _shared(self, n_bytes: int) -> SharedSum | None:
         """Memory through which so many bytes can be added, if all ranks are on one machine."""

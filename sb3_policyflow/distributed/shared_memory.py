@@ -10,6 +10,8 @@ import platform
 import tempfile
 import time
 import uuid
+from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -52,19 +54,27 @@ class SharedSum:
         """Bytes of an array, at most."""
         return self._rows.shape[2]
 
-    def add(self, values: th.Tensor) -> None:
-        """Replace a tensor on the CPU by its sum over the ranks.
+    def add(self, tensors: Sequence[th.Tensor], divisor: int = 1) -> None:
+        """Replace tensors by their sums over the ranks.
 
+        :param tensors: Those of which :func:`can_be_shared` is true.
+        :param divisor: What the sums are divided by, if it is not 1.
         :raises RuntimeError: If a rank has stopped, or is gone.
         """
-        array = values.view(-1).numpy()
+        arrays = [tensor.view(-1).numpy() for tensor in tensors]
+        ends = list(accumulate(array.size for array in arrays))
         self._turn += 1
-        rows = self._rows[self._turn % 2, :, : array.nbytes].view(array.dtype)
-        rows[self._rank] = array
+        n_bytes, dtype = ends[-1] * arrays[0].itemsize, arrays[0].dtype
+        rows = self._rows[self._turn % 2, :, :n_bytes].view(dtype)
+        np.concatenate(arrays, out=rows[self._rank])
         self._turns[self._rank] = self._turn
         self._wait()
         with np.errstate(all="ignore"):
-            np.add.reduce(rows, axis=0, out=array)
+            sums = np.add.reduce(rows, axis=0)
+            if divisor != 1:
+                sums /= divisor
+        for array, end in zip(arrays, ends, strict=True):
+            array[:] = sums[end - array.size : end]
 
     def stop(self) -> None:
         """Tell the others that this rank has stopped."""
@@ -101,6 +111,16 @@ def _lives(process: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def can_be_shared(tensors: Sequence[th.Tensor]) -> bool:
+    """Whether tensors are contiguous, on the CPU, and of one type.
+
+    >>> can_be_shared([th.zeros(2), th.zeros(3, 3)]), can_be_shared([th.zeros(3, 3)[:, 0]])
+    (True, False)
+    """
+    dtype = tensors[0].dtype
+    return all(t.is_cpu and t.dtype is dtype and t.is_contiguous() for t in tensors)
 
 
 def share_memory(group: Any, n_bytes: int, timeout: float) -> SharedSum | None:
