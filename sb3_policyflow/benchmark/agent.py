@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 
+from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -48,7 +50,7 @@ def make_demonstrations(path: Path, steps: int = AGENT_STEPS, n: int = N_DEMONST
     :param steps: Environment steps of the agent's training.
     :param n: Episodes.
     """
-    if path.is_file():
+    if path.is_file() and _report(path).is_file():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as logs:
@@ -68,13 +70,23 @@ def make_demonstrations(path: Path, steps: int = AGENT_STEPS, n: int = N_DEMONST
         model.get_env().close()
 
 
-def demonstrated_return(path: Path) -> float:
-    """The mean sum of rewards of the agent's episodes."""
-    return float(json.loads(_report(path).read_text(encoding="utf-8"))["mean_return"])
+def wanted_return(path: Path) -> float:
+    """Twice the mean sum of rewards of the agent's episodes.
+
+    :raises BenchmarkError: If that is not more.
+    """
+    mean = float(json.loads(_report(path).read_text(encoding="utf-8"))["mean_return"])
+    if mean <= 0:
+        raise BenchmarkError(
+            f"{_report(path)} has a mean return of {mean:.0f}, twice which is no more: delete it, "
+            "and train the agent for longer (AGENT_STEPS)."
+        )
+    return 2 * mean
 
 
 def _report(path: Path) -> Path:
-    return path.with_suffix(".json")
+    """Where it is said what the agent did: beside the folder of what is not kept."""
+    return path.parents[1] / "agent.json"
 
 
 def runs(arguments: argparse.Namespace) -> list[Run]:
@@ -141,10 +153,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> int:
     """Make the demonstrations, train what is missing and write the table."""
+    require_env(ENV)
+    th.set_num_threads(arguments.threads)
     path = demonstrations(arguments.out)
     make_demonstrations(path)
     code = run_and_report(runs(arguments), arguments)
-    table = agent_table(load_results(arguments.out), 2 * demonstrated_return(path))
+    table = agent_table(load_results(arguments.out), wanted_return(path))
     (arguments.out / "agent.md").write_text(table, encoding="utf-8")
     print(f"Wrote {arguments.out / 'agent.md'}.")
     return code

@@ -262,9 +262,11 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
             candidates = candidate_latents(self.action_dim, scale).to(features)
         else:
             candidates = scale * candidate_latents(self.action_dim).to(features)
-        return self.densest(candidates, features)
+        return self.choose_latents(candidates, features)
 
-    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def choose_latents(
+        self, candidates: th.Tensor, features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Of latents (k, action_dim) the one whose end point has the most others around it.
 
         :param candidates: The latents to choose from.
@@ -355,11 +357,15 @@ class ContinuousFlowPolicy(FlowPolicy):
         """End points of the flow, see :meth:`FlowPolicy.transport`."""
         return self.flow.solve(latents, features)
 
-    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """See :meth:`FlowPolicy.densest`; subclasses with a transport of their own are followed."""
-        if type(self).transport is not ContinuousFlowPolicy.transport:
-            return super().densest(candidates, features)
-        return self.flow.densest(candidates, features)
+    def choose_latents(
+        self, candidates: th.Tensor, features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """See :meth:`FlowPolicy.choose_latents`."""
+        flow, carry = self.flow, getattr(self.transport, "__func__", None)
+        is_plain = type(flow) is Flow and isinstance(flow.velocity, VelocityField)
+        if is_plain and carry is ContinuousFlowPolicy.transport:
+            return flow.choose_latents(candidates, features)  # in one call, where kernels can
+        return super().choose_latents(candidates, features)
 
     def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
         """Draw where flow matching compares the velocity on the way to end points (n, dim)."""

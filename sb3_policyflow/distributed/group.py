@@ -134,10 +134,11 @@ class ProcessGroup(Ranks):
 
     def average_gradients(self, parameters: Iterable[th.nn.Parameter], loss: float) -> float:
         gradients = [p.grad for p in parameters if p.grad is not None]
-        own_loss = gradients[0].new_zeros(self.size)
-        own_loss[self.rank] = self.size * loss
+        precise = th.promote_types(gradients[0].dtype, th.float32)
+        own_loss = gradients[0].new_zeros(self.size, dtype=precise)
+        own_loss[self.rank] = loss
         self._sum([*gradients, own_loss], divisor=self.size)
-        losses = own_loss.tolist()
+        losses = [self.size * part for part in own_loss.tolist()]
         for rank, one in enumerate(losses):
             if not math.isfinite(one):
                 raise FloatingPointError(
@@ -179,7 +180,7 @@ class ProcessGroup(Ranks):
         return received if self.rank > 0 else value
 
     def sum(self, values: th.Tensor) -> th.Tensor:
-        """The sum of the ranks' tensors, on the CPU."""
+        """The sum of the ranks' tensors."""
         total = values.clone()
         self._sum([total])
         return total
@@ -197,20 +198,26 @@ class ProcessGroup(Ranks):
         :param tensors: The tensors, of floating-point numbers unless the divisor is 1.
         :param divisor: What the sums are divided by.
         """
+        # Ranks must agree on the way. All have tensors of the same shapes on the same kind of
+        # device, but one of them may have them in another layout.
+        flat = None if can_be_shared(tensors) else _flattened(tensors)
+        parts = tensors if flat is None else [flat]
         with self._answered():
-            if can_be_shared(tensors):
-                shared = self._shared(sum(tensor.nbytes for tensor in tensors))
-                if shared is not None:
-                    shared.add(tensors, divisor)
-                    return
-            flat = th.cat([tensor.reshape(-1) for tensor in tensors])
+            n_bytes = sum(part.nbytes for part in parts)
+            shared = self._shared(n_bytes) if tensors[0].device.type == "cpu" else None
+            if shared is not None:
+                shared.add(parts, divisor)
+        if shared is None:
+            flat = _flattened(tensors) if flat is None else flat
             takes_cpu = flat.is_cuda or dist.get_backend() != "nccl"
-            dist.all_reduce(flat, group=None if takes_cpu else self._control)
+            with self._answered():
+                dist.all_reduce(flat, group=None if takes_cpu else self._control)
             if divisor != 1:
                 flat /= divisor
-            parts = th.split(flat, [tensor.numel() for tensor in tensors])
-            sums = [part.view_as(tensor) for part, tensor in zip(parts, tensors, strict=True)]
-            th._foreach_copy_(tensors, sums)
+        if flat is not None:
+            sizes = [tensor.numel() for tensor in tensors]
+            sums = zip(th.split(flat, sizes), tensors, strict=True)
+            th._foreach_copy_(tensors, [part.view_as(tensor) for part, tensor in sums])
 
     def _shared(self, n_bytes: int) -> SharedSum | None:
         """Memory through which so many bytes can be added, if all ranks are on one machine."""
@@ -220,6 +227,12 @@ class ProcessGroup(Ranks):
             self._shared_sum = share_memory(self, n_bytes, UPDATE_TIMEOUT.total_seconds())
             self._may_share = self._shared_sum is not None
         return self._shared_sum
+
+
+def _flattened(tensors: list[th.Tensor]) -> th.Tensor:
+    """The numbers of tensors, one behind the other, of a type that ranks can add on the CPU."""
+    flat = th.cat([tensor.reshape(-1) for tensor in tensors])
+    return flat.float() if flat.is_cpu and flat.dtype is th.bfloat16 else flat
 
 
 @functools.cache

@@ -114,13 +114,15 @@ def _lives(process: int) -> bool:
 
 
 def can_be_shared(tensors: Sequence[th.Tensor]) -> bool:
-    """Whether tensors are contiguous, on the CPU, and of one type.
+    """Whether tensors are contiguous, on the CPU, and of one type that NumPy has.
 
     >>> can_be_shared([th.zeros(2), th.zeros(3, 3)]), can_be_shared([th.zeros(3, 3)[:, 0]])
     (True, False)
     """
     dtype = tensors[0].dtype
-    return all(t.is_cpu and t.dtype is dtype and t.is_contiguous() for t in tensors)
+    return dtype is not th.bfloat16 and all(
+        t.is_cpu and t.dtype is dtype and t.is_contiguous() for t in tensors
+    )
 
 
 def share_memory(group: Any, n_bytes: int, timeout: float) -> SharedSum | None:

@@ -46,14 +46,16 @@ class Flow(NamedTuple):
         """
         return self.velocity.integrate(latents, features, **self._method())
 
-    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def choose_latents(
+        self, candidates: th.Tensor, features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Of some latents, the one whose end point has the most others around it.
 
         :param candidates: The latents to choose from, shape (k, dim).
         :param features: s, shape (n, features_dim).
         :return: For each row of features the latent, and its end point, each of shape (n, dim).
         """
-        return self.velocity.densest(candidates, features, **self._method())
+        return self.velocity.choose_latents(candidates, features, **self._method())
 
     def _method(self) -> _Method:
         return {

@@ -189,7 +189,7 @@ class VelocityField(nn.Module):
             end_time=end_time,
         )
 
-    def densest(
+    def choose_latents(
         self,
         candidates: th.Tensor,
         features: th.Tensor,
@@ -201,7 +201,7 @@ class VelocityField(nn.Module):
         """Of some latents, the one whose end point has the most others around it.
 
         >>> field, latents, s = VelocityField(2, 3, [16]), th.randn(16, 2), th.randn(5, 3)
-        >>> chosen, ends = field.densest(latents, s, solver="midpoint", n_steps=4)
+        >>> chosen, ends = field.choose_latents(latents, s, solver="midpoint", n_steps=4)
         >>> chosen.shape, ends.shape
         (torch.Size([5, 2]), torch.Size([5, 2]))
 

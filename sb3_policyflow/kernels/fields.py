@@ -148,7 +148,7 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
             latents, features, solver=solver, n_steps=n_steps, end_time=end_time
         )
 
-    def densest(
+    def choose_latents(
         self,
         candidates: th.Tensor,
         features: th.Tensor,
@@ -157,10 +157,12 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
         n_steps: int,
         end_time: float = 1.0,
     ) -> tuple[th.Tensor, th.Tensor]:
-        plan = self._plan(candidates, features, solver, n_steps, end_time)
+        plan = None
+        if type(self).integrate is KernelVelocityField.integrate:
+            plan = self._plan(candidates, features, solver, n_steps, end_time)
         if plan is not None:
-            return plan.densest(candidates, features)
-        return super().densest(
+            return plan.choose_latents(candidates, features)
+        return super().choose_latents(
             candidates, features, solver=solver, n_steps=n_steps, end_time=end_time
         )
 

@@ -37,7 +37,9 @@ class FlowPlan(NamedTuple):
         self._run(features, latents, NO_CHOICE, endpoints, self.flops_per_row)
         return endpoints
 
-    def densest(self, candidates: th.Tensor, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def choose_latents(
+        self, candidates: th.Tensor, features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Choose among candidates (k, dim) with features (n, features_dim), each (n, dim)."""
         k, dim = candidates.shape
         shape = features.shape[0], dim

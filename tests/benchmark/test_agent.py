@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow.benchmark import agent
+from sb3_policyflow.benchmark.errors import BenchmarkError
 from sb3_policyflow.benchmark.results import Result, Run, load_results
 from sb3_policyflow.benchmark.train_one import train_one
 
@@ -45,6 +46,12 @@ def test_table_says_how_many_seeds_have_reached_it() -> None:
     assert "| scratch | 1 | 200 | 0 | 1 | never |" in table
 
 
+def test_twice_a_negative_return_is_no_goal(tmp_path: Path) -> None:
+    (tmp_path / "agent.json").write_text('{"mean_return": -3.0}')
+    with pytest.raises(BenchmarkError, match="mean return of -3, twice which is no more"):
+        agent.wanted_return(agent.demonstrations(tmp_path))
+
+
 @pytest.mark.slow
 def test_an_agent_demonstrates_and_is_cloned(tmp_path: Path) -> None:
     parser = ArgumentParser()
@@ -59,6 +66,6 @@ def test_an_agent_demonstrates_and_is_cloned(tmp_path: Path) -> None:
         train_one(
             replace(run, steps=2048, hyperparams=small, n_evaluations=1, n_episodes=1), tmp_path
         )
-    table = agent.agent_table(load_results(tmp_path), 2 * agent.demonstrated_return(path))
+    table = agent.agent_table(load_results(tmp_path), 100.0)
     assert "| cloned | 1 | 2,048 |" in table
     assert "| scratch | 1 | 2,048 |" in table

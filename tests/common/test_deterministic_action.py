@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.dppo import DPPOPolicy
 from sb3_policyflow.export import ActionModule
+from sb3_policyflow.flows import Flow
 from sb3_policyflow.flows.modes import candidate_latents, densest
 from sb3_policyflow.fpo import FPOPolicy
+from sb3_policyflow.kernels import KernelVelocityField
 from sb3_policyflow.policyflow import PolicyFlowPolicy
 from tests.helpers import SMALL, TINY
 
@@ -46,6 +49,44 @@ def test_is_in_a_mode_where_zero_is_between(policy_class: type[Any]) -> None:
     policy.deterministic_action = "zero"
     between = policy.predict(np.zeros(3, np.float32), deterministic=True)[0]
     np.testing.assert_allclose(between, 0, atol=1e-6)
+
+
+class ShiftedFlow(Flow):
+    """Ends at 0.25, whatever the field says."""
+
+    def solve(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        return th.full_like(latents, 0.25)
+
+
+class WithShiftedFlow(FPOPolicy):
+    @property
+    def flow(self) -> Flow:
+        return ShiftedFlow(*super().flow)
+
+
+class ShiftedField(KernelVelocityField, has_formula_of_paper=True):
+    def integrate(self, latents: th.Tensor, features: th.Tensor, **_: Any) -> th.Tensor:
+        return th.full_like(latents, 0.25)
+
+
+class OtherField(nn.Module):
+    def integrate(self, latents: th.Tensor, features: th.Tensor, **_: Any) -> th.Tensor:
+        return th.full_like(latents, 0.25)
+
+
+@pytest.mark.parametrize("kind", ["flow", "field", "module", "function"])
+def test_what_carries_latents_is_what_the_choice_is_made_by(kind: str) -> None:
+    """However it was replaced."""
+    policy_class = WithShiftedFlow if kind == "flow" else FPOPolicy
+    policy: Any = policy_class(OBSERVATIONS, ACTIONS, lambda _: 1e-3)
+    if kind == "field":
+        policy.velocity = ShiftedField(2, 3, [8])
+    if kind == "module":
+        policy.velocity = OtherField()
+    if kind == "function":
+        policy.transport = lambda latents, features: th.full_like(latents, 0.25)
+    action = policy.predict(np.zeros(3, np.float32), deterministic=True)[0]
+    np.testing.assert_array_equal(action, [0.25, 0.25])
 
 
 def test_the_mode_of_one_cluster_is_near_its_center() -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_policyflow.distributed.group import ProcessGroup
 from tests.distributed import workers
 from tests.distributed.launch import run_ranks
 
@@ -20,6 +21,27 @@ def test_merged_statistics_are_those_of_one_process_that_saw_everything() -> Non
         for merged, whole in zip(several, one, strict=True):
             for ours, theirs in zip(merged, whole, strict=True):
                 np.testing.assert_allclose(ours, theirs, rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "layout", ["plain", "channels last on rank 1", "two types", "half of the bits"]
+)
+def test_gradients_are_averaged_whatever_their_layout(layout: str) -> None:
+    """Of rank r they are (r + 1) n + 1 for n = 0, 1, ...: in the mean 2 n + 1."""
+    for loss, *gradients in run_ranks(3, workers.mean_gradients, layout):
+        assert loss == [pytest.approx(370.0)]
+        assert gradients == [[2.0 * n + 1 for n in range(size)] for size in (24, 1, 0, 3)]
+
+
+def test_a_lack_of_memory_is_this_rank_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        raise th.OutOfMemoryError("no memory left")
+
+    parameter = th.nn.Parameter(th.zeros(2, 3))
+    parameter.grad = th.zeros(3, 2).T
+    monkeypatch.setattr(th, "cat", fails)
+    with pytest.raises(th.OutOfMemoryError, match="no memory left"):
+        ProcessGroup(1, 2).average_gradients([parameter], 0.0)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
+from sb3_policyflow.distributed.group import process_group
 from sb3_policyflow.distributed.ranks import current
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
 from sb3_policyflow.resilience.checkpoints import RolloutCheckpointCallback
@@ -64,6 +65,32 @@ def recorded_statistics(n_envs: int) -> list[Any]:
     normalize = VecNormalize(DummyVecEnv(makers), gamma=0.9)  # type: ignore[arg-type]
     model_of(normalize).learn(3 * 16 * n_envs)
     return [(s.mean, s.var, s.count) for s in (normalize.obs_rms, normalize.ret_rms)]
+
+
+# Gradients
+
+
+def mean_gradients(layout: str) -> list[list[float]]:
+    """The ranks' mean of a loss and of gradients, one of which may have another layout on rank 1.
+
+    :param layout: "plain", "channels last on rank 1", "two types" or "half of the bits".
+    """
+    ranks = process_group()
+    ranks.connect(th.device("cpu"))
+    dtypes = {"two types": (th.float32, th.float64), "half of the bits": (th.bfloat16,) * 2}
+    first, second = dtypes.get(layout, (th.float32, th.float32))
+    shapes: Any = [((2, 3, 2, 2), first), ((), second), ((0,), first), ((3,), second)]
+    parameters = [th.nn.Parameter(th.zeros(shape, dtype=dtype)) for shape, dtype in shapes]
+    gradients = []
+    for parameter in parameters:
+        numbers = th.arange(parameter.numel(), dtype=parameter.dtype).view(parameter.shape)
+        gradients.append((ranks.rank + 1) * numbers + 1)
+    if ranks.rank == 1 and layout.startswith("channels last"):
+        gradients[0] = gradients[0].to(memory_format=th.channels_last)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    loss = ranks.average_gradients(parameters, 10.0 ** (1 + ranks.rank))
+    return [[loss], *(gradient.flatten().tolist() for gradient in gradients)]
 
 
 # Faults

@@ -95,7 +95,7 @@ def test_choice_of_a_latent(
     candidates, s = th.randn(n_candidates, dim), 3 * th.randn(n_rows, features_dim)
     options: dict[str, Any] = {"solver": "midpoint", "n_steps": 4}
     with th.no_grad():
-        latents, ends = field.densest(candidates, s, **options)
+        latents, ends = field.choose_latents(candidates, s, **options)
     plain, expected = plain_copy(field).double(), []
     for latent, features in zip(latents, s, strict=True):
         same = features.double().expand(n_candidates, -1)
@@ -114,8 +114,8 @@ def test_choice_of_a_latent_for_nobody_and_among_one() -> None:
     field = make_field(2, 3, [8])
     options: dict[str, Any] = {"solver": "euler", "n_steps": 2}
     with th.no_grad():
-        nobody = field.densest(th.randn(4, 2), th.zeros(0, 3), **options)
-        latents, _ = field.densest(th.ones(1, 2), th.zeros(5, 3), **options)
+        nobody = field.choose_latents(th.randn(4, 2), th.zeros(0, 3), **options)
+        latents, _ = field.choose_latents(th.ones(1, 2), th.zeros(5, 3), **options)
     assert [part.shape for part in nobody] == [(0, 2), (0, 2)]
     assert th.equal(latents, th.ones(5, 2))
 
