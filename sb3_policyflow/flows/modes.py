@@ -8,8 +8,8 @@ import torch as th
 from numpy.typing import NDArray
 
 N_CANDIDATES = 16
-"""How many latents the deterministic action is chosen from. Twice as many are in a likely place
-hardly more often, and take twice the time."""
+"""How many latents the deterministic action is chosen from. Of twice as many, the chosen one lies
+in a likely place 1 to 6 percent more often (``tests/scripts/candidates.py``)."""
 BANDWIDTH = 0.5
 """Bandwidth of the density estimate in units of Scott's rule, which is for a single mode."""
 FIRST = 1.5
