@@ -16,7 +16,12 @@ from sb3_policyflow.common.minibatches import (
     Minibatches,
     minibatches_of,
 )
-from sb3_policyflow.common.optimization import check_step, clip_gradients, take_step
+from sb3_policyflow.common.optimization import (
+    check_step,
+    clip_gradients,
+    critic_apart,
+    take_step,
+)
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -57,6 +62,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     :param allow_nan_observations: Whether the features extractor can handle observations that are
         not finite, such as NaN for a missing reading. By default they stop the training.
     :param n_critic_warmup: Rollouts at the start from which only the critic learns.
+    :param critic_learning_rate: Learning rate of the critic's own parameters, in ``ent_coef``'s
+        forms; None for that of the actor, which ``desired_kl`` may adapt.
     :param imitation_coef: Weight of the squared change of the velocity since the policy was cloned
         from demonstrations, see :func:`sb3_policyflow.imitation.clone`. Takes ``ent_coef``'s forms.
     :param policy_options: Options of the policy that are the algorithm's own: the keyword-only
@@ -138,6 +145,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         timeout_bootstrap: str = "terminal",
         allow_nan_observations: bool = False,
         n_critic_warmup: int = 0,
+        critic_learning_rate: Coefficient | None = None,
         imitation_coef: Coefficient = 0.0,
         **policy_options: Any,
     ) -> None:
@@ -155,6 +163,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.timeout_bootstrap = timeout_bootstrap
         self.allow_nan_observations = allow_nan_observations
         self.n_critic_warmup = n_critic_warmup
+        self.critic_learning_rate = critic_learning_rate
         self.imitation_coef = imitation_coef
         self.policy_options = policy_options
         self.has_former_defaults = False  # an attribute of files
@@ -226,6 +235,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     ) -> None:
         options.take_up_changes(self)
         start_adaptive_learning_rate(self)
+        if self.critic_learning_rate is not None:
+            rate = self.value_of("critic_learning_rate")
+            self.logger.record("train/critic_learning_rate", rate)
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)
             return
@@ -291,8 +303,16 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         mean_loss = self.ranks.average_gradients(parameters, loss.item())
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(mean_loss, norm, self.num_timesteps, self.divergence_advice)
-        take_step(self.policy.optimizer)
+        self._take_step(self.policy.optimizer)
         self.policy.keep_within_bounds()
+
+    def _take_step(self, optimizer: th.optim.Optimizer) -> None:
+        if self.critic_learning_rate is None:
+            take_step(optimizer)
+            return
+        rate = self.value_of("critic_learning_rate")
+        with critic_apart(optimizer, self.policy.critic_parameters(), rate):
+            take_step(optimizer)
 
     def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""

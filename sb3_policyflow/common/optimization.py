@@ -1,7 +1,8 @@
 """The optimizer of a policy, and a step of it."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch as th
@@ -55,6 +56,34 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None
     if factor < 1 and math.isfinite(norm):
         th._foreach_mul_(grads, factor)
     return norm
+
+
+@contextmanager
+def critic_apart(
+    optimizer: th.optim.Optimizer, critic: Iterable[th.nn.Parameter], learning_rate: float
+) -> Iterator[None]:
+    """A block in which the critic's parameters have a learning rate of their own.
+
+    They are a group of the optimizer for no longer, so that its state is laid out as ever.
+
+    :param optimizer: The optimizer.
+    :param critic: The critic's parameters.
+    :param learning_rate: Theirs.
+    """
+    groups, critic = optimizer.param_groups, set(critic)
+    optimizer.param_groups = []
+    for group in groups:
+        own = [parameter for parameter in group["params"] if parameter in critic]
+        others = [parameter for parameter in group["params"] if parameter not in critic]
+        optimizer.param_groups += [
+            {**group, "params": parameters, "lr": rate}
+            for parameters, rate in ((others, group["lr"]), (own, learning_rate))
+            if parameters
+        ]
+    try:
+        yield
+    finally:
+        optimizer.param_groups = groups
 
 
 def take_step(optimizer: th.optim.Optimizer) -> None:

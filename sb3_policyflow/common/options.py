@@ -70,6 +70,7 @@ class FlowOptions(TypedDict, total=False):
     timeout_bootstrap: str
     allow_nan_observations: bool
     n_critic_warmup: int
+    critic_learning_rate: Coefficient | None
     imitation_coef: Coefficient
 
 
@@ -90,6 +91,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "advantage_scope": checks.one_of(("minibatch", "rollout")),
     "timeout_bootstrap": checks.one_of(("terminal", "current", "none")),
     "n_critic_warmup": checks.at_least(0),
+    "critic_learning_rate": checks.or_none(parse_schedule),
     "imitation_coef": parse_schedule,
 }
 """Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""

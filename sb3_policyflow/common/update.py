@@ -251,9 +251,14 @@ def check_model(model: Any) -> None:
     :raises TypeError: If a critic is to be trained alone that cannot be told from the actor.
     """
     networks = model.policy.mlp_extractor
-    if model.n_critic_warmup > 0 and not hasattr(networks, "value_net"):
+    tells_apart = {
+        "n_critic_warmup": model.n_critic_warmup or None,
+        "critic_learning_rate": model.critic_learning_rate,
+    }
+    given = [f"{name}={value}" for name, value in tells_apart.items() if value is not None]
+    if given and not hasattr(networks, "value_net"):
         raise TypeError(
-            f"n_critic_warmup={model.n_critic_warmup} needs to know which part of "
+            f"{given[0]} needs to know which part of "
             f"{type(networks).__name__} is the critic's: make it a module named value_net, as in "
             "stable_baselines3.common.torch_layers.MlpExtractor."
         )

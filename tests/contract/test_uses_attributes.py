@@ -44,6 +44,7 @@ SHARED: dict[str, Any] = {
     "timeout_bootstrap": "none",
     "n_steps": 24,
     "n_critic_warmup": 1,
+    "critic_learning_rate": 1e-4,
     "imitation_coef": 50.0,
 }
 DRAWN: dict[str, Any] = {"n_entropy_actions": 3, "n_entropy_states": 2}

@@ -110,6 +110,7 @@ common: dict[str, st.SearchStrategy[Any]] = {
     "advantage_scope": st.sampled_from(["minibatch", "rollout"]),
     "timeout_bootstrap": st.sampled_from(["terminal", "current", "none"]),
     "n_critic_warmup": st.integers(0, 2),
+    "critic_learning_rate": st.none() | st.floats(0.0, 1e-2),
 }
 ode: dict[str, st.SearchStrategy[Any]] = {
     "solver": st.sampled_from(["euler", "midpoint", "heun", "rk4", "ab2"]),
@@ -173,6 +174,7 @@ refused: dict[str, list[Any]] = {
     "vf_coef": [float("nan")],
     "desired_kl": [0.0],
     "n_critic_warmup": [-1],
+    "critic_learning_rate": [-1.0, "high"],
     "lr_adaptation_kwargs": [{"interval": "step"}, {"bounds": (1e-2, 1e-6)}, {"factor": 1.0}],
     "use_sde": [True],
 }
