@@ -79,9 +79,14 @@ MULTI_GOAL = Task(
             "brownian_coef": 0.05,
             "imitation_kwargs": {"noise_std": 0.3},
         },
+        # What is left of the critic's error when the actor begins to learn decides between goals,
+        # and so does the noise of advantages: a long warm-up, and a short horizon of lambda.
         "slow": {
-            "learning_rate": 3e-4,
-            "brownian_coef": 0.05,
+            "n_critic_warmup": 60,
+            "learning_rate": "lin_1.4e-4",
+            "critic_learning_rate": "lin_1.4e-3",
+            "gae_lambda": 0.8,
+            "brownian_coef": "lin_0.15_0.1",
             "imitation_kwargs": {"noise_std": 0.5},
         },
     },
