@@ -148,7 +148,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--steps", type=float, default=3e5, help="environment steps of each; default: 3e5"
     )
     add_running_arguments(parser, Path("docs/results/agent"))
-    parser.set_defaults(episodes=10, evaluations=30)
+    parser.set_defaults(episodes=5, evaluations=30)
 
 
 def main(arguments: argparse.Namespace) -> int:
