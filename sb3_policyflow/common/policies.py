@@ -26,13 +26,7 @@ from sb3_policyflow.common.names import (
 )
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.common.options import accepts_former_names
-from sb3_policyflow.flows import (
-    INITIALIZATIONS,
-    Flow,
-    MatchingSamples,
-    VelocityField,
-    draw_matching,
-)
+from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
 from sb3_policyflow.kernels import KernelCritic, are_in_mode, has_values, make_velocity_field
 from sb3_policyflow.resilience.finite import check_actions
@@ -333,43 +327,6 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
 
     def keep_within_bounds(self) -> None:
         """Clamp parameters that have bounds, after a step of the optimizer."""
-
-
-class ContinuousFlowPolicy(FlowPolicy):
-    """A flow policy whose end points are those of a differential equation, of its velocity field.
-
-    Takes the arguments of :class:`FlowPolicy`.
-    """
-
-    def _build_actor(self) -> None:
-        self.velocity = self._make_velocity_field()
-
-    @property
-    @abstractmethod
-    def flow(self) -> Flow:
-        """The flow from latents to end points."""
-
-    @property
-    def n_evaluations_per_action(self) -> int:
-        return self.flow.n_evaluations
-
-    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """End points of the flow, see :meth:`FlowPolicy.transport`."""
-        return self.flow.solve(latents, features)
-
-    def choose_latents(
-        self, candidates: th.Tensor, features: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """See :meth:`FlowPolicy.choose_latents`."""
-        flow, carry = self.flow, getattr(self.transport, "__func__", None)
-        is_plain = type(flow) is Flow and isinstance(flow.velocity, VelocityField)
-        if is_plain and carry is ContinuousFlowPolicy.transport:
-            return flow.choose_latents(candidates, features)  # in one call, where kernels can
-        return super().choose_latents(candidates, features)
-
-    def draw_matching(self, endpoints: th.Tensor) -> MatchingSamples:
-        """Draw where flow matching compares the velocity on the way to end points (n, dim)."""
-        return draw_matching(self.flow.interpolant, endpoints, self.latent_scale)
 
 
 FlowActorCriticPolicy = FlowPolicy

@@ -9,8 +9,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.continuous import ContinuousFlowPolicy
 from sb3_policyflow.common.options import FlowOptions
-from sb3_policyflow.common.policies import ContinuousFlowPolicy
 from sb3_policyflow.flows import SOLVERS, Flow, Rectified
 
 

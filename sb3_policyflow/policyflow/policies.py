@@ -11,8 +11,8 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.continuous import ContinuousFlowPolicy
 from sb3_policyflow.common.options import FlowOptions, accepts_former_names
-from sb3_policyflow.common.policies import ContinuousFlowPolicy
 from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
 from sb3_policyflow.flows.bounds import half_ranges
 
