@@ -62,10 +62,15 @@ def flow(
 @inner
 def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
     """The point around which the others lie most densely; densities are space."""
-    scale = _mean_square(points) * F(choice.bandwidth)
-    if scale == F(0.0):
+    n_points, squares = points.shape[0], F(0.0)
+    for i in range(n_points):
+        for j in range(i):
+            squares += _squared_distance(points[i], points[j])
+    if squares == F(0.0):
         return 0  # all points are the same
-    for i in range(points.shape[0]):
+    # Over all pairs, squared distances add up to n times those from the mean.
+    scale = squares * F(choice.bandwidth / n_points**2)
+    for i in range(n_points):
         densities[i] = F(1.0)
         for j in range(i):
             density = np.exp(-_squared_distance(points[i], points[j]) / scale)
@@ -73,25 +78,10 @@ def _densest(points: Floats, choice: Choice, densities: Floats) -> int:
             densities[j] += density
     densities[0] *= F(choice.first)
     chosen = 0
-    for i in range(1, points.shape[0]):
+    for i in range(1, n_points):
         if densities[i] > densities[chosen]:
             chosen = i
     return chosen
-
-
-@inner
-def _mean_square(points: Floats) -> Any:
-    """The mean square of the distances from the mean."""
-    n_points, dim = points.shape
-    squares = F(0.0)
-    for column in range(dim):
-        mean = F(0.0)
-        for i in range(n_points):
-            mean += points[i, column]
-        mean /= F(n_points)
-        for i in range(n_points):
-            squares += (points[i, column] - mean) ** 2
-    return squares / F(n_points)
 
 
 @inner
