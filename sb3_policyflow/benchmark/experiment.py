@@ -25,7 +25,7 @@ def make_experiment(
     :param hyperparams: What differs from the YAML file.
     """
     return ExperimentManager(
-        argparse.Namespace(),
+        argparse.Namespace(env_kwargs=None),  # what rl_zoo3's enjoy reads of a command line
         algo,
         env,
         logs,

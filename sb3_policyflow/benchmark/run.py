@@ -24,7 +24,13 @@ EXIT = "exit code "
 """With what the last line of a training's log begins."""
 
 
-def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int = 1) -> list[Run]:
+def run_all(
+    runs: Iterable[Run],
+    folder: Path,
+    n_jobs: int = 1,
+    n_threads: int = 1,
+    agents: Path | None = None,
+) -> list[Run]:
     """Run what has not been run, each training in a process of its own.
 
     What a process says goes to ``NAME/ENV/seed-N.log``, which stays only if it fails.
@@ -33,6 +39,7 @@ def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int =
     :param folder: Where results are and go.
     :param n_jobs: Processes at a time.
     :param n_threads: Threads of each.
+    :param agents: Where trained agents go; None to keep none.
     :return: The runs that failed.
     :raises BenchmarkError: If one has been run with other settings.
     """
@@ -44,7 +51,7 @@ def run_all(runs: Iterable[Run], folder: Path, n_jobs: int = 1, n_threads: int =
         steps_of_runs(missing, folder, bar),
         ThreadPoolExecutor(n_jobs) as pool,
     ):
-        jobs = {pool.submit(_succeeds, run, folder, n_threads): run for run in missing}
+        jobs = {pool.submit(_succeeds, run, folder, n_threads, agents): run for run in missing}
         for job in as_completed(jobs):
             run = jobs[job]
             if not job.result():
@@ -92,12 +99,13 @@ def _share_of_steps(run: Run, folder: Path) -> str:
     return "" if not lines or lines[-1].startswith(EXIT) else (shares or ["starting"])[-1]
 
 
-def _succeeds(run: Run, folder: Path, n_threads: int) -> bool:
+def _succeeds(run: Run, folder: Path, n_threads: int, agents: Path | None) -> bool:
     """Train in another process and wait for it; whether all went well."""
     log = run.path(folder, ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "sb3_policyflow.benchmark", "train-one"]
     command += [json.dumps(asdict(run)), str(folder), "--threads", str(n_threads)]
+    command += [] if agents is None else ["--agents", str(agents)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(n_threads))
     with open(log, "w", encoding="utf-8") as file:
         outcome = subprocess.run(
@@ -118,7 +126,8 @@ def run_and_report(runs: Iterable[Run], arguments: argparse.Namespace) -> int:
     :return: The exit code of the command.
     """
     runs = list(runs)
-    failed = run_all(runs, arguments.out, arguments.jobs, arguments.threads)
+    agents = getattr(arguments, "agents", None)  # not every command keeps them
+    failed = run_all(runs, arguments.out, arguments.jobs, arguments.threads, agents)
     for run in failed:
         print(f"failed: {run}", file=sys.stderr)
     print(f"{len(runs) - len(failed)} of {len(runs)} results are in {arguments.out}.", flush=True)
@@ -166,6 +175,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default={},
         metavar="NAME:VALUE",
         help="what differs from the YAML files, as rl_zoo3 takes it, for example n_epochs:4",
+    )
+    parser.add_argument(
+        "--agents",
+        type=Path,
+        metavar="FOLDER",
+        help="keep the trained agents there, for rl_zoo3.enjoy -f FOLDER/seed-N",
     )
     add_running_arguments(parser, DEFAULT_FOLDER)
 

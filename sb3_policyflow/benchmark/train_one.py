@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 import tempfile
 import time
 from dataclasses import asdict
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -37,11 +39,12 @@ class ProgressCallback(BaseCallback):
         print(f"{PROGRESS}{min(share, 1.0):.0%}", flush=True)
 
 
-def train_one(run: Run, folder: Path) -> Result:
+def train_one(run: Run, folder: Path, agents: Path | None = None) -> Result:
     """Train as ``python -m rl_zoo3.train`` does, evaluate, and write the results.
 
     :param run: What to train.
     :param folder: Where the results go.
+    :param agents: Where the trained agent goes, see :func:`keep_agent`.
     """
     with tempfile.TemporaryDirectory() as logs:
         manager = make_experiment(run.algo, run.env, run.steps, run.seed, logs, run.hyperparams)
@@ -66,6 +69,8 @@ def train_one(run: Run, folder: Path) -> Result:
             counter.visits().save(_archive(run, folder, ".npz"))
         if run.n_trajectories:
             summary["goals"] = _goals(model, run, folder, ".npz")
+        if agents is not None:
+            keep_agent(manager, model, agents)
         env.close()
         manager_env = model.get_env()
         assert manager_env is not None
@@ -73,6 +78,20 @@ def train_one(run: Run, folder: Path) -> Result:
     result = Result(run, summary, evaluations.curve)
     result.save(folder)
     return result
+
+
+def keep_agent(manager: ExperimentManager, model: OnPolicyAlgorithm, folder: Path) -> None:
+    """Keep an agent where ``python -m rl_zoo3.enjoy -f FOLDER/seed-N`` finds it.
+
+    :param manager: The experiment that trained it.
+    :param model: The agent; it loses its optimizer's state, which takes two thirds of a file.
+    :param folder: Where agents are.
+    """
+    model.policy.optimizer.state.clear()
+    manager.save_trained_model(model)
+    place = folder / f"seed-{manager.seed}" / manager.algo / f"{manager.env_name}_1"
+    unwanted = shutil.ignore_patterns("*.monitor.csv", "command.txt")
+    shutil.copytree(manager.save_path, place, ignore=unwanted, dirs_exist_ok=True)
 
 
 def train_and_measure(
@@ -153,10 +172,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=json.loads, help="the fields of a Run, as JSON")
     parser.add_argument("folder", type=Path, help="where the results go")
     parser.add_argument("--threads", type=int, default=1, help="threads of torch")
+    parser.add_argument("--agents", type=Path, help="where the trained agent goes")
 
 
 def main(arguments: argparse.Namespace) -> int:
     """Train as ``run_all`` asks for it."""
     th.set_num_threads(arguments.threads)
-    train_one(Run(**arguments.run), arguments.folder)
+    train_one(Run(**arguments.run), arguments.folder, arguments.agents)
     return 0

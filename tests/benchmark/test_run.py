@@ -71,6 +71,30 @@ def test_what_is_written(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("algo", ["policyflow", "ppo"])
+def test_rl_zoo3_enjoys_agents_that_are_kept(tmp_path: Path, algo: str) -> None:
+    agents = tmp_path / "agents"
+    settings = ["--envs", "MountainCarContinuous-v0", "--steps", "10", "--seeds", "7"]
+    settings += ["--evaluations", "1", "--episodes", "1", "--hyperparams", "n_epochs:1"]
+    kept = ["--out", str(tmp_path / "results"), "--agents", str(agents)]
+    outcome = benchmark("run", "--algos", algo, *settings, *kept)
+    assert outcome.returncode == 0, outcome.stderr
+    place = agents / "seed-7" / algo / "MountainCarContinuous-v0_1"
+    files = {path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()}
+    name = "MountainCarContinuous-v0"
+    described = {f"{name}/{file}" for file in ("args.yml", "config.yml", "vecnormalize.pkl")}
+    assert files == {f"{name}.zip", *described}
+    model: Any = {"policyflow": PolicyFlow, "ppo": PPO}[algo].load(place / f"{name}.zip")
+    n_bytes = 4 * sum(parameter.numel() for parameter in model.policy.parameters())
+    assert (place / f"{name}.zip").stat().st_size < n_bytes + 50_000
+    command = [sys.executable, "-m", "rl_zoo3.enjoy", "--algo", algo, "--env", name]
+    command += ["-f", str(agents / "seed-7"), "--no-render", "-n", "1000"]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert shown.returncode == 0, shown.stderr
+    assert "Episode Reward" in shown.stdout
+
+
+@pytest.mark.slow
 def test_what_has_been_run_is_not_run_again(folder: Path) -> None:
     before = (folder / "ppo/Pendulum-v1/seed-0.json").stat().st_mtime_ns
     # What a killed run leaves behind does not count.
