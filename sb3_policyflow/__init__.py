@@ -6,7 +6,7 @@ from sb3_policyflow.fpo import FPO
 from sb3_policyflow.integrations.rl_zoo3 import startup
 from sb3_policyflow.policyflow import PolicyFlow
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = ["DPPO", "FPO", "PolicyFlow", "__version__"]
 
