@@ -29,8 +29,8 @@ class Shifts(NamedTuple):
 
     ``exact`` integrates the flow with both policies. ``approximate`` is the paper's approximation:
     the change of the velocity at points between latent and old end point, averaged over the
-    solver's times. ``sampled`` is the same average over the times that the algorithm draws, which
-    is what its loss uses.
+    solver's times. ``sampled`` is the same average over the times that the algorithm draws: what
+    its loss uses with one time, or with ``time_average="shift"``.
     """
 
     exact: th.Tensor

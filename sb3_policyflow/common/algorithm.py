@@ -50,9 +50,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     supported, ``max_grad_norm`` may be None or not positive for no clipping, and coefficients and
     rates may be schedules, also as "lin_START" or "lin_START_END"; and:
 
-    :param desired_kl: Target of the KL-adaptive learning rate, which starts at ``learning_rate``:
-        a constant, "lin_START", "lin_START_END" or a function of the remaining progress; None to
-        follow ``learning_rate``.
+    :param desired_kl: Divergence in nats that the adaptive learning rate aims at: a constant,
+        "lin_START", "lin_START_END" or a function of the remaining progress. The rate then starts
+        at ``learning_rate``. None for no adaptation.
     :param lr_adaptation_kwargs: Options of the adaptive learning rate, those of
         :class:`~sb3_policyflow.common.schedules.KLAdaptiveLearningRate`.
     :param advantage_scope: Where advantages are normalized: in each "minibatch", as SB3 does, or
@@ -318,7 +318,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
         if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
-            self.logger.info(f"PyTorch replaces the compiled kernels and is slower: {reason}.")
+            self.logger.info(f"The compiled kernels are off, and training is slower: {reason}.")
         kept = self.rollout_buffer.values, self.rollout_buffer.returns
         arrays = (th.as_tensor(each, device="cpu").numpy().flatten() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}

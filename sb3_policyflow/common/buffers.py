@@ -20,6 +20,7 @@ class RecordBufferMixin(RolloutBuffer):
     """
 
     record_type: type[Any] | None
+    _record_fields: tuple[str, ...] = ()
     pending_bonus: PendingBonus | None
     """What is to be added to the rewards of the next step: see :class:`PendingBonus`."""
 
@@ -63,7 +64,13 @@ class RecordBufferMixin(RolloutBuffer):
         super().add(obs, action, reward, episode_start, value, self._no_log_prob)
 
     def _allocate(self, record: Any) -> None:
-        self.record_type = type(record)
+        taken = [name for name in record._fields if hasattr(self, name)]
+        if set(taken) - set(self._record_fields):
+            raise TypeError(
+                f"A field of {type(record).__name__} cannot have the name of an attribute of "
+                f"{type(self).__name__}: rename {', '.join(taken)}."
+            )
+        self.record_type, self._record_fields = type(record), record._fields
         for name, values in record._asdict().items():
             shape = (self.buffer_size, *values.shape)
             setattr(self, name, np.zeros(shape, dtype=values.cpu().numpy().dtype))

@@ -10,7 +10,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
 from torch import nn
 
 from sb3_policyflow.common.buffers import (
@@ -107,14 +112,6 @@ def positive_up_to(highest: float) -> Check:
     return check
 
 
-def positive_or_none(name: str, value: object) -> None:
-    """A positive number, or None for no bound."""
-    if value is None:
-        return
-    if not isinstance(value, Real) or not float(value) > 0:
-        raise ValueError(f"{name} must be positive, or None for no bound, got {value!r}.")
-
-
 def bounds(name: str, value: object) -> None:
     """A lowest and a highest number, which may be the same."""
     ends = list(value) if isinstance(value, Sequence) else []
@@ -139,16 +136,6 @@ def or_none(check: Check) -> Check:
             check(name, value)
 
     return check_unless_none
-
-
-def or_schedule(check: Check) -> Check:
-    """What another check allows, or a schedule, which is a function."""
-
-    def check_unless_function(name: str, value: object) -> None:
-        if not callable(value):
-            check(name, value)
-
-    return check_unless_function
 
 
 def check_policy_class(algorithm: str, policy_class: type[Any], base: type[Any]) -> None:
@@ -227,6 +214,11 @@ def check_extractor(
         raise ValueError(
             f"{policy_class.__name__} is for observations that are a Dict, and these are "
             f"{observation_space}: use {algorithm}('MlpPolicy', ...), or 'CnnPolicy' for images."
+        )
+    if extractor in (FlattenExtractor, NatureCNN) and is_dict:
+        raise ValueError(
+            f"{extractor.__name__} takes a single array, and these observations are a Dict: use "
+            f"{algorithm}('MultiInputPolicy', ...)."
         )
 
 

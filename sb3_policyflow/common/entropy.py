@@ -1,10 +1,11 @@
 """The entropy of actions, for policies that can be sampled but have no likelihood."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 
+from sb3_policyflow.common import checks
 from sb3_policyflow.common.policies import FlowPolicy
 
 SMALLEST_DISTANCE = 1e-6
@@ -46,6 +47,13 @@ def action_entropy(policy: FlowPolicy, features: th.Tensor, n_actions: int) -> t
     return nearest_neighbor_entropy(actions.reshape(len(features), n_actions, -1))
 
 
+ENTROPY_CHECKS: dict[str, checks.Check] = {
+    "n_entropy_actions": checks.at_least(2),
+    "n_entropy_states": checks.at_least(1),
+}
+"""Checks of the options that :meth:`EntropyBonus.of` reads."""
+
+
 class EntropyBonus(NamedTuple):
     """Rewards the entropy of the actions, estimated from several actions in each of some states.
 
@@ -60,6 +68,12 @@ class EntropyBonus(NamedTuple):
     coef: float
     n_actions: int
     n_states: int
+
+    @classmethod
+    def of(cls, algorithm: Any) -> "EntropyBonus":
+        """The bonus in an algorithm's update; each rank takes its share of the states."""
+        n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
+        return cls(algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, n_states)
 
     def regularizer(
         self, policy: FlowPolicy, features: th.Tensor

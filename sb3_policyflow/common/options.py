@@ -3,6 +3,7 @@
 import functools
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypedDict, cast
 
@@ -82,7 +83,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "gamma": checks.between(0.0, 1.0),
     "gae_lambda": checks.between(0.0, 1.0),
     "ent_coef": parse_schedule,
-    "target_kl": checks.positive_or_none,
+    "target_kl": checks.or_none(checks.positive),
     "desired_kl": checks.or_none(parse_schedule),
     "lr_adaptation_kwargs": check_lr_adaptation,
     "max_grad_norm": checks.or_none(checks.between(-math.inf)),
@@ -94,7 +95,7 @@ SHARED_CHECKS: dict[str, checks.Check] = {
     "critic_learning_rate": checks.or_none(parse_schedule),
     "imitation_coef": parse_schedule,
 }
-"""Checks of the shared options by name. ``batch_size`` and schedules are checked with others."""
+"""Checks of the shared options by name; :func:`check_values` has those of several together."""
 
 FORMER_NAMES = {
     "_n_rollouts": "n_rollouts",
@@ -281,6 +282,12 @@ def check_algorithm(model: Any) -> None:
             )
     check_values(model)
     if not is_loaded:
+        if model.desired_kl is None and model.lr_adaptation_kwargs:
+            warnings.warn(
+                "lr_adaptation_kwargs have no effect: they say how the learning rate follows "
+                "desired_kl, which is None.",
+                stacklevel=2,
+            )
         checks.warn_of_batches(model.batch_size, model.n_steps, model.ranks.size * model.n_envs)
 
 

@@ -55,6 +55,18 @@ def parse_schedule(name: str, value: object) -> FloatSchedule:
     return FloatSchedule(ConstantSchedule(start) if constant else LinearSchedule(start, end, 1.0))
 
 
+def is_zero(value: object) -> bool:
+    """Whether a coefficient as :func:`parse_schedule` takes it is 0 throughout.
+
+    >>> is_zero(0.0), is_zero("0"), is_zero("lin_0.1")
+    (True, True, False)
+    """
+    if callable(value):
+        return False
+    schedule = parse_schedule("coefficient", value)
+    return schedule(1.0) == schedule(0.0) == 0
+
+
 def positive_at_first(name: str, value: object) -> None:
     """A coefficient as :func:`parse_schedule` takes it that is not zero at the start.
 

@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
+from sb3_policyflow.common.schedules import is_zero
 from sb3_policyflow.kernels import has_fixed_features
 
 
@@ -271,7 +272,7 @@ def check_cloned(model: Any) -> None:
 
     :raises ValueError: If the model was not cloned from demonstrations.
     """
-    if model.imitation_coef != 0 and model.cloned_parameters is None:
+    if not is_zero(model.imitation_coef) and model.cloned_parameters is None:
         raise ValueError(
             f"imitation_coef={model.imitation_coef!r} pulls towards a policy that was cloned from "
             "demonstrations, and this model was not: call sb3_policyflow.imitation.clone first, or "

@@ -95,9 +95,10 @@ class DeviceCollection:
         actions, values, record = model.policy(self.obs)
         low, high = self._bounds
         if model.policy.squash_output:
-            clipped = low + (0.5 * (actions + 1.0) * (high - low))
+            unbounded = low + (0.5 * (actions + 1.0) * (high - low))
         else:
-            clipped = th.clamp(actions, low, high)
+            unbounded = actions
+        clipped = th.clamp(unbounded, low, high)  # of scaled actions, what rounding adds
         step = self.env.env.step(clipped)
         self._last = step
         dones = step.terminated | step.truncated

@@ -11,10 +11,11 @@ from typing_extensions import Unpack
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.entropy import EntropyBonus
+from sb3_policyflow.common.entropy import ENTROPY_CHECKS, EntropyBonus
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_NAMES, shares_options
+from sb3_policyflow.common.schedules import parse_schedule
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.dppo.policies import (
     CnnFlowPolicy,
@@ -40,10 +41,7 @@ class DPPOUpdate(FlowUpdate):
         super().__init__(algorithm, rollout)
         self.log_prob_clamp = algorithm.log_prob_clamp
         self.log_prob_reduction = algorithm.log_prob_reduction
-        n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
-        self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, n_states
-        )
+        self.entropy_bonus = EntropyBonus.of(algorithm)
         self.stds = self.policy.log_prob_stds
         n_steps = len(self.stds)
         like_stds: Any = {"device": self.stds.device, "dtype": self.stds.dtype}
@@ -86,6 +84,20 @@ class DPPOUpdate(FlowUpdate):
         return log_probs.sum(-1) if self.log_prob_reduction == "sum" else log_probs.mean(-1)
 
 
+def check_clip_ranges(model: Any) -> None:
+    """Refuse a clip range that would fall from the first trained step to the last.
+
+    :param model: A DPPO.
+    :raises ValueError: If the first one is the greater.
+    """
+    base, last = model.clip_range_base, parse_schedule("clip_range", model.clip_range)(1.0)
+    if base is not None and base > last:
+        raise ValueError(
+            f"clip_range_base={base!r} is the clip range of the first trained step, from which it "
+            f"rises to clip_range={last:g}: give a smaller one, or None for the same in each."
+        )
+
+
 class DPPO(FlowOnPolicyAlgorithm):
     """On-policy learning with diffusion policies.
 
@@ -123,11 +135,11 @@ class DPPO(FlowOnPolicyAlgorithm):
         "log_prob_clamp": checks.or_none(checks.bounds),
         "log_prob_reduction": checks.one_of(("mean", "sum")),
         "denoising_gamma": checks.positive_up_to(1.0),
-        "clip_range_base": checks.positive_or_none,
+        "clip_range_base": checks.or_none(checks.positive),
         "clip_range_rate": checks.positive,
-        "n_entropy_actions": checks.at_least(2),
-        "n_entropy_states": checks.at_least(1),
+        **ENTROPY_CHECKS,
     }
+    model_checks = (check_clip_ranges,)
 
     @shares_options(FlowOnPolicyAlgorithm, DPPOPolicy, FORMER_NAMES)
     def __init__(

@@ -112,7 +112,7 @@ class DPPOPolicy(FlowPolicy):
         "n_finetuned_steps": checks.or_none(checks.at_least(1)),
         "min_sampling_std": checks.positive,
         "min_log_prob_std": checks.positive,
-        "noise_clip": checks.positive_or_none,
+        "noise_clip": checks.or_none(checks.positive),
         "denoised_clip": checks.positive,
     }
     fixed_options = frozenset(

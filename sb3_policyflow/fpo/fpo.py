@@ -1,6 +1,5 @@
 """FPO: PPO with the change of a flow-matching loss in place of that of a likelihood."""
 
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -11,7 +10,7 @@ from typing_extensions import Unpack
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
-from sb3_policyflow.common.entropy import EntropyBonus
+from sb3_policyflow.common.entropy import ENTROPY_CHECKS, EntropyBonus
 from sb3_policyflow.common.losses import SURROGATES, ratio_divergence
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
@@ -55,10 +54,7 @@ class FPOUpdate(FlowUpdate):
         super().__init__(algorithm, rollout)
         policy = algorithm.policy
         self.algorithm = algorithm
-        n_states = math.ceil(algorithm.n_entropy_states / algorithm.ranks.size)
-        self.entropy_bonus = EntropyBonus(
-            algorithm.value_of("ent_coef"), algorithm.n_entropy_actions, n_states
-        )
+        self.entropy_bonus = EntropyBonus.of(algorithm)
         n_samples, action_dim = rollout.actions.shape
         sampler = TIME_SAMPLERS[algorithm.time_sampler](policy.flow.times())
         times = sampler.sample(n_samples, algorithm.n_mc_samples)
@@ -161,10 +157,9 @@ class FPO(FlowOnPolicyAlgorithm):
         "loss_reduction": checks.one_of(("mean", "sum")),
         "time_sampler": checks.one_of(TIME_SAMPLERS),
         "trust_region": checks.one_of(SURROGATES),
-        "loss_clamp": checks.positive_or_none,
-        "difference_clamp": checks.positive_or_none,
-        "n_entropy_actions": checks.at_least(2),
-        "n_entropy_states": checks.at_least(1),
+        "loss_clamp": checks.or_none(checks.positive),
+        "difference_clamp": checks.or_none(checks.positive),
+        **ENTROPY_CHECKS,
     }
 
     # The ratio is that of an average over samples, and moves less than a likelihood's.

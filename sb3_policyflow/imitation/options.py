@@ -24,7 +24,7 @@ class CloningOptions:
         "gradient_steps": checks.at_least(1),
         "batch_size": checks.at_least(1),
         "learning_rate": parse_schedule,
-        "noise_std": checks.positive_or_none,
+        "noise_std": checks.or_none(checks.positive),
         "validation_fraction": checks.between(0.0, 0.9),
         "eval_freq": checks.at_least(1),
         "patience": checks.or_none(checks.at_least(1)),

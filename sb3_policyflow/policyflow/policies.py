@@ -59,12 +59,11 @@ def check_latents(policy: "PolicyFlowPolicy") -> None:
 class PolicyFlowPolicy(ContinuousFlowPolicy):
     """Actor-critic policy that transports Gaussian latents along a flow (paper, policy).
 
-    z ~ N(0, I),    dx/dt = v(x, t, s) from x_0 = z to phi = x_T,    a = phi + n,  n ~ N(0, sigma^2)
+    z ~ N(0, s_z^2),  dx/dt = v(x, t, s) from x_0 = z to phi = x_T,  a = phi + n,  n ~ N(0, sigma^2)
 
-    The paper's latents have a standard deviation of 1. Latents spread the actions, and the
-    importance ratio does not see that; where actions are bounded by 1, they would drown the noise
-    that it sees. By default they are in proportion to the action space, which is 1 on the paper's
-    MultiGoal.
+    Latents spread the actions, and the importance ratio does not see that. In the paper s_z is 1;
+    where actions are bounded by 1, such latents would drown the noise that the ratio sees. By
+    default s_z is a fifth of half the range of each action: 1 on the paper's MultiGoal.
 
     Takes the arguments of :class:`~sb3_policyflow.common.policies.FlowPolicy`, and:
 
@@ -73,9 +72,9 @@ class PolicyFlowPolicy(ContinuousFlowPolicy):
     :param n_flow_steps: Solver steps from z to phi, which also make the grid of the update's times.
         The paper has 12, which follow a flow to several good actions more accurately.
     :param solver: "euler", "midpoint", "heun", "rk4" or "ab2".
-    :param latent_std: Standard deviation of the latents z, greater than 0. None for a fifth of half
-        the distance of the actions' bounds in each dimension, or 1 where there are no bounds, or
-        none within 200, or where the interpolant has noise of its own: "stochastic" ones need 1.
+    :param latent_std: Standard deviation s_z of the latents z, greater than 0. None for a fifth of
+        half the range of each action. It is 1 where bounds are 200 or more apart, as they stand for
+        none, and with a stochastic interpolant, which needs that.
     :param gaussian: Whether z is always 0, which leaves a Gaussian policy with mean phi.
     :param log_std_init: Initial log standard deviation of the Gaussian noise.
     :param log_std_bounds: Lowest and highest log standard deviation of the noise; None for none.

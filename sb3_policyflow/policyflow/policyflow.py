@@ -19,7 +19,7 @@ from sb3_policyflow.common.losses import (
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.names import policy_aliases
 from sb3_policyflow.common.options import FORMER_DEFAULTS, FORMER_NAMES, shares_options
-from sb3_policyflow.common.schedules import Coefficient, parse_schedule
+from sb3_policyflow.common.schedules import Coefficient, is_zero, parse_schedule
 from sb3_policyflow.common.tree import in_chunks
 from sb3_policyflow.common.update import FlowUpdate, PolicyTerms
 from sb3_policyflow.flows import TIME_SAMPLERS
@@ -74,7 +74,7 @@ class PolicyFlowUpdate(FlowUpdate):
         self.brownian_reduction = algorithm.brownian_reduction
         self.ent_coef = algorithm.value_of("ent_coef")  # w_g
         self.uniform_coef = algorithm.value_of("uniform_noise_coef")
-        has_targets = algorithm.uniform_noise_coef != 0.0
+        has_targets = not is_zero(algorithm.uniform_noise_coef)
         self.uniform_targets = UniformTargets.of(policy) if has_targets else None
         if type(self) is PolicyFlowUpdate:  # a subclass may have other formulas
             self.compiled_loss = make_compiled_loss(self)
@@ -180,7 +180,7 @@ class PolicyFlow(FlowOnPolicyAlgorithm):
         "time_average": checks.one_of(("objective", "shift")),
         "brownian_reduction": checks.one_of(("sum", "mean")),
         "uniform_noise_coef": parse_schedule,
-        "log_ratio_clamp": checks.positive_or_none,
+        "log_ratio_clamp": checks.or_none(checks.positive),
     }
     model_checks = (check_regularizers,)
 

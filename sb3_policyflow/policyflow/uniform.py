@@ -2,10 +2,13 @@
 
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_policyflow.common.schedules import is_zero
 from sb3_policyflow.flows import Interpolant, VelocityField
+from sb3_policyflow.flows.bounds import SHORTEST_MEANINGLESS, half_ranges
 from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
 
 
@@ -21,7 +24,8 @@ class UniformTargets:
     :param action_space: The actions; SB3 takes bounded ones only.
     :param interpolant: The interpolant of the update.
     :param latent_std: Standard deviation of the latents: a number, or one for each dimension.
-    :raises ValueError: If the interpolant draws noise of its own.
+    :raises ValueError: If the interpolant draws noise of its own, or actions have no bounds that
+        mean something.
     """
 
     def __init__(
@@ -34,6 +38,11 @@ class UniformTargets:
             raise ValueError(
                 "uniform_noise_coef needs an interpolant without noise of its own: use "
                 "interpolant='rectified' or interpolant='trigflow'."
+            )
+        if not np.isfinite(half_ranges(action_space.low, action_space.high)).all():
+            raise ValueError(
+                "uniform_noise_coef spreads actions over their space, which has no bounds if they "
+                f"are {SHORTEST_MEANINGLESS:g} or more apart: use brownian_coef."
             )
         self._interpolant = interpolant
         self._latent_std = latent_std
@@ -69,10 +78,11 @@ def check_regularizers(model: Any) -> None:
     :param model: A PolicyFlow.
     :raises ValueError: If there is no flow, or one that is stochastic, for them to act on.
     """
-    if model.policy.gaussian and (model.brownian_coef, model.uniform_noise_coef) != (0.0, 0.0):
+    coefficients = model.brownian_coef, model.uniform_noise_coef
+    if model.policy.gaussian and not all(map(is_zero, coefficients)):
         raise ValueError(
             "A Gaussian policy has no flow to spread: with gaussian=True leave brownian_coef "
             "and uniform_noise_coef at 0, and use ent_coef."
         )
-    if model.uniform_noise_coef != 0.0:
+    if not is_zero(model.uniform_noise_coef):
         UniformTargets.of(model.policy)

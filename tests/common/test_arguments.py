@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
+from sb3_policyflow.policyflow import MlpFlowPolicy
 from tests.helpers import SMALL
 
 
@@ -136,8 +137,8 @@ def test_options_of_policyflow(options: dict[str, Any], message: str) -> None:
         (FPO, {"loss_reduction": "max"}, "loss_reduction must be one of 'mean', 'sum'"),
         (FPO, {"time_sampler": "beta"}, "time_sampler must be one of"),
         (FPO, {"trust_region": "trpo"}, "trust_region must be one of 'ppo', 'spo', 'aspo'"),
-        (FPO, {"loss_clamp": 0.0}, "loss_clamp must be positive, or None"),
-        (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, or None"),
+        (FPO, {"loss_clamp": 0.0}, "loss_clamp must be positive, got 0.0"),
+        (FPO, {"difference_clamp": -1.0}, "difference_clamp must be positive, got -1.0"),
         (FPO, {"action_noise_std": -0.1}, "action_noise_std must be a number from 0"),
         (FPO, {"solver": "newton"}, "solver must be one of 'euler', .*, got 'newton'"),
         (FPO, {"n_flow_steps": 0}, "n_flow_steps must be at least 1"),
@@ -159,6 +160,7 @@ def test_options_of_policyflow(options: dict[str, Any], message: str) -> None:
         (DPPO, {"log_prob_reduction": "max"}, "log_prob_reduction must be one of"),
         (DPPO, {"denoising_gamma": 1.5}, r"denoising_gamma must be in \(0, 1\]"),
         (DPPO, {"clip_range_base": 0.0}, "clip_range_base must be positive"),
+        (DPPO, {"clip_range_base": 0.5, "clip_range": 0.1}, r"0.5 is .* rises to clip_range=0.1"),
         (DPPO, {"n_critic_warmup": -1}, "n_critic_warmup must be at least 0"),
         (DPPO, {"n_entropy_states": 0}, "n_entropy_states must be at least 1"),
         (DPPO, {"use_sde": True}, "use_sde=True is not supported"),
@@ -188,9 +190,21 @@ def test_policies_of_another_kind() -> None:
         PolicyFlow("GaussianPolicy", "Pendulum-v1")
 
 
-def test_flat_policy_for_dict_observations() -> None:
+@pytest.mark.parametrize("policy", ["MlpPolicy", "MlpFlowPolicy", "CnnFlowPolicy", MlpFlowPolicy])
+def test_flat_policy_for_dict_observations(policy: Any) -> None:
     with pytest.raises(ValueError, match="MultiInputPolicy"):
-        PolicyFlow("MlpPolicy", SimpleMultiObsEnv(discrete_actions=False))
+        PolicyFlow(policy, SimpleMultiObsEnv(discrete_actions=False))
+
+
+def test_an_adaptation_of_nothing_is_announced() -> None:
+    with pytest.warns(UserWarning, match="have no effect: .* desired_kl, which is None"):
+        PolicyFlow("MlpPolicy", "Pendulum-v1", lr_adaptation_kwargs={"factor": 2.0}, **SMALL)
+
+
+@pytest.mark.parametrize("zero", [0.0, "0", "lin_0"])
+def test_coefficients_of_zero_in_any_form(zero: Any) -> None:
+    coefficients = dict.fromkeys(("brownian_coef", "uniform_noise_coef", "imitation_coef"), zero)
+    PolicyFlow("MlpPolicy", "Pendulum-v1", gaussian=True, **coefficients, **SMALL).learn(16)
 
 
 @pytest.mark.parametrize(

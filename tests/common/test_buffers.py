@@ -90,3 +90,18 @@ def test_log_probabilities_in_place_of_a_record_are_refused() -> None:
     step = (observations(VECTOR), np.zeros((3, 2)), np.zeros(3), np.zeros(3))
     with pytest.raises(TypeError, match="use SB3's RolloutBuffer"):
         buffer.add(*step, th.zeros(3), th.zeros(3))
+
+
+class Taken(NamedTuple):
+    values: th.Tensor
+
+
+@pytest.mark.parametrize("n_rollouts", [1, 2])
+def test_fields_of_a_record_do_not_replace_attributes_of_the_buffer(n_rollouts: int) -> None:
+    buffer = FlowRolloutBuffer(N_STEPS, VECTOR, ACTIONS, n_envs=N_ENVS)
+    for _ in range(n_rollouts - 1):
+        fill(buffer, RolloutBuffer(N_STEPS, VECTOR, ACTIONS, n_envs=N_ENVS))
+        buffer.reset()
+    step = (observations(VECTOR), np.zeros((N_ENVS, 2)), *np.zeros((2, N_ENVS)))
+    with pytest.raises(TypeError, match=r"cannot have the name of an attribute .*: rename values"):
+        buffer.add(*step, th.zeros(N_ENVS), Taken(th.ones(N_ENVS)))

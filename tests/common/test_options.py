@@ -85,7 +85,7 @@ def test_options_may_change_when_loading(algorithm: type[Any], tmp_path: Path) -
             {"desired_kl": 0.01, "lr_adaptation": "minibatch", "lr_bounds": [1e-5, 1e-3]},
             {"lr_adaptation_kwargs": {"interval": "minibatch", "bounds": [1e-5, 1e-3]}},
         ),
-        (FPO, {"kl_margin": 3.0, "lr_factor": 1.2, "kl_window": "update"}, {}),
+        (FPO, {"desired_kl": 0.01, "kl_margin": 3.0, "lr_factor": 1.2}, {}),
     ],
     ids=str,
 )

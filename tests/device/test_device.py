@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import DPPO, PolicyFlow
 from sb3_policyflow.envs.multigoal import MultiGoalTensorEnv, MultiGoalVecEnv
 from sb3_policyflow.envs.tensor import TensorEnvAdapter, TensorStep, TensorVecEnv
 from tests.helpers import train, weights
@@ -167,6 +167,29 @@ def test_dictionaries_of_observations_in_a_users_own_class(algorithm: type[Any])
         for env in (DictEnv(), VecMonitor(TensorEnvAdapter(DictEnv())))
     ]
     assert th.equal(weights(models[0]), weights(models[1]))
+
+
+class Bounded(MultiGoalTensorEnv):
+    """Has bounds that scaled actions leave by their rounding, and looks at what it is given."""
+
+    def __init__(self, n_envs: int) -> None:
+        super().__init__(n_envs)
+        low, high = np.random.default_rng(0).uniform([[-3.0], [0.0]], [[0.0], [3.0]], (2, 2))
+        self.action_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+        self.n_at_bounds = 0
+
+    def step(self, actions: th.Tensor) -> TensorStep:
+        low, high = th.as_tensor(self.action_space.low), th.as_tensor(self.action_space.high)
+        assert (actions >= low).all()
+        assert (actions <= high).all()
+        self.n_at_bounds += int((actions == high).sum())
+        return super().step(actions)
+
+
+def test_scaled_actions_stay_within_their_bounds() -> None:
+    env = Bounded(N_ENVS)
+    train(model_in(env, DPPO, process="ddpm"), N_ENVS * N_STEPS)
+    assert env.n_at_bounds > 0
 
 
 def test_the_class_in_the_documentation() -> None:

@@ -62,6 +62,12 @@ def test_gaussian_mode_has_no_flow_to_spread() -> None:
             PolicyFlow("MlpPolicy", "Pendulum-v1", **GAUSSIAN, **{option: 0.1})
 
 
+@pytest.mark.parametrize("bound", [100.0, 1e10, float(np.finfo(np.float32).max)])
+def test_uniform_targets_need_bounds(bound: float) -> None:
+    with pytest.raises(ValueError, match="has no bounds if they are 200 or more apart"):
+        UniformTargets(spaces.Box(-bound, bound, (2,)), Rectified())
+
+
 @pytest.mark.parametrize("latent_std", [1.0, 0.4])
 def test_uniform_targets_make_actions_uniform(latent_std: float) -> None:
     """A field trained on nothing else carries its latents to the uniform distribution."""
