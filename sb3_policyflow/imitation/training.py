@@ -65,6 +65,8 @@ class CloningRun:
                     self._write()
                 if not callback.on_step():
                     break
+            if self._losses:  # of steps since the last validation: a callback has stopped it
+                self._validate()
         self._policy.load_state_dict(self._best)
         self._policy.set_training_mode(False)
         if options.checkpoint is not None:

@@ -163,15 +163,24 @@ def test_the_best_parameters_are_kept_and_cloning_stops_early() -> None:
     assert all(th.isfinite(parameter).all() for parameter in learned(model.policy))
 
 
-def test_a_callback_stops_it() -> None:
+@pytest.mark.parametrize("validation_fraction", [0.0, 0.1])
+@pytest.mark.parametrize("n_steps", [7, 17, 20])
+def test_a_callback_stops_it_and_what_was_learned_is_kept(
+    n_steps: int, validation_fraction: float
+) -> None:
+    """Before the first validation, between two of them, and at one."""
     steps: list[int] = []
 
     def stop(*_: Any) -> bool:
         steps.append(1)
-        return len(steps) < 7
+        return len(steps) < n_steps
 
-    clone(pendulum(FPO), shown(), callback=stop, **SHORT)
-    assert len(steps) == 7
+    options = {**SHORT, "learning_rate": 1e-3, "validation_fraction": validation_fraction}
+    stopped = clone(pendulum(FPO), shown(), callback=stop, **options)
+    assert len(steps) == n_steps
+    short = clone(pendulum(FPO), shown(), **{**options, "gradient_steps": n_steps})
+    assert th.equal(weights(stopped), weights(short))
+    assert not th.equal(weights(stopped), weights(pendulum(FPO)))
 
 
 def test_callbacks_save_and_logs_are_written(tmp_path: Path) -> None:
