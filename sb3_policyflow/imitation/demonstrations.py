@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -48,14 +49,25 @@ class Demonstrations(NamedTuple):
 
         :param path: The file.
         """
+        with atomic_write(path, suffix="npz") as file:
+            np.savez_compressed(file, **self._arrays())
+
+    def digest(self) -> str:
+        """A hash of all arrays, by which the same demonstrations are known again."""
+        sha = hashlib.sha256()
+        for name, array in sorted(self._arrays().items()):
+            sha.update(f"{name} {array.dtype} {array.shape}".encode())
+            sha.update(np.ascontiguousarray(array))
+        return sha.hexdigest()
+
+    def _arrays(self) -> dict[str, np.ndarray]:
         is_dict = isinstance(self.observations, dict)
         parts = self.observations if is_dict else {"": self.observations}
         arrays = {f"observations{'/' if is_dict else ''}{key}": parts[key] for key in parts}
         arrays["actions"] = self.actions
         if self.episodes is not None:
             arrays["episodes"] = self.episodes
-        with atomic_write(path, suffix="npz") as file:
-            np.savez_compressed(file, **arrays)
+        return arrays
 
 
 def rows(observations: Observations, indices: Any) -> Observations:

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.imitation import clone
+from sb3_policyflow.imitation import Demonstrations, clone
 from tests.helpers import SMALL, TINY, learned, weights
 from tests.imitation.short import ALGORITHMS, SHORT, pendulum, shown
 
@@ -77,12 +77,88 @@ def test_an_interrupted_cloning_continues_to_the_last_bit(
     assert not checkpoint.exists()
 
 
-def test_a_checkpoint_of_another_cloning_is_refused(tmp_path: Path) -> None:
-    options = {**SHORT, "checkpoint": tmp_path / "state"}
+def interrupted(model: Any, demonstrations: Any, **options: Any) -> Path:
+    """The checkpoint of a cloning that was interrupted after its second validation."""
     with pytest.raises(KeyboardInterrupt):
-        clone(pendulum(FPO), shown(), callback=Interruption(20), **options)
-    with pytest.raises(ValueError, match="delete it, or name another checkpoint"):
-        clone(pendulum(FPO), shown(300), **options)
+        clone(model, demonstrations, callback=Interruption(20), **options)
+    return Path(options["checkpoint"])
+
+
+def numbered(n_episodes: int = 4) -> Demonstrations:
+    observations, actions = shown()
+    return Demonstrations(observations, actions, np.arange(256) % n_episodes)
+
+
+@pytest.mark.parametrize(
+    "demonstrations",
+    [
+        Demonstrations(*shown(300)),
+        Demonstrations(*shown()),
+        numbered(5),
+        numbered()._replace(actions=-numbered().actions),
+        numbered()._replace(observations=numbered().observations + 1e-3),
+    ],
+    ids=["more of them", "without episodes", "other episodes", "other actions", "other places"],
+)
+def test_a_checkpoint_of_other_demonstrations_is_refused(
+    demonstrations: Demonstrations, tmp_path: Path
+) -> None:
+    options = {**SHORT, "checkpoint": tmp_path / "state"}
+    interrupted(pendulum(FPO), numbered(), **options)
+    with pytest.raises(ValueError, match="name another checkpoint, or delete it"):
+        clone(pendulum(FPO), demonstrations, **options)
+    clone(pendulum(FPO), numbered(), **options)
+
+
+def test_other_dictionaries_are_other_demonstrations() -> None:
+    one, two = (Demonstrations({"a": np.zeros((2, 1)), "b": x}, np.ones((2, 1))) for x in np.eye(2))
+    renamed = Demonstrations({"b": np.zeros((2, 1)), "a": np.eye(2)[0]}, np.ones((2, 1)))
+    digests = [shown.digest() for shown in (one, two, renamed)]
+    assert len(set(digests)) == 3
+    again = Demonstrations({"b": np.eye(2)[0], "a": np.zeros((2, 1))}, np.ones((2, 1)))
+    assert again.digest() == one.digest()
+
+
+@pytest.mark.parametrize(
+    ("options", "model"),
+    [
+        ({"learning_rate": 1e-4}, {}),
+        ({"learning_rate": lambda _: 1e-3}, {}),
+        ({"batch_size": 16}, {}),
+        ({}, {"algorithm": DPPO}),
+        ({}, {"n_flow_steps": 3}),
+        ({}, {"policy_kwargs": {"net_arch": [9]}}),
+    ],
+    ids=str,
+)
+def test_a_checkpoint_of_other_options_or_networks_is_refused(
+    options: dict[str, Any], model: dict[str, Any], tmp_path: Path
+) -> None:
+    same = {**SHORT, "learning_rate": 1e-3, "checkpoint": tmp_path / "state"}
+    interrupted(pendulum(FPO), shown(), **same)
+    with pytest.raises(ValueError, match="name another checkpoint, or delete it"):
+        clone(pendulum(**{"algorithm": FPO, **model}), shown(), **{**same, **options})
+
+
+def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
+    options = {**SHORT, "checkpoint": tmp_path / "state"}
+    state = th.load(interrupted(pendulum(FPO), shown(), **options), weights_only=False)
+    names = ("gradient_steps", "batch_size", "validation_fraction", "eval_freq", "seed")
+    earlier = {name: state["settings"][name] for name in names}
+    earlier |= {"n": 256, "parameters": state["settings"]["parameters"]}
+    for name, content in {
+        "earlier": {**state, "settings": earlier},
+        "weights": {"weights": 1},
+        "list": [1],
+    }.items():
+        th.save(content, tmp_path / name)
+    pendulum(FPO).save(tmp_path / "model.zip")
+    (tmp_path / "text").write_bytes(b"text")
+    (tmp_path / "empty").touch()
+    for name in ("earlier", "weights", "list", "model.zip", "text", "empty"):
+        with pytest.raises(ValueError, match=f"{name} is not the state .* or delete it"):
+            clone(pendulum(FPO), shown(), **{**SHORT, "checkpoint": tmp_path / name})
+        assert (tmp_path / name).is_file()
 
 
 def test_training_goes_on_with_the_same_numbers_after_a_file(tmp_path: Path) -> None:
