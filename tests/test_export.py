@@ -231,6 +231,17 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
         main([str(tmp_path / "nope"), str(tmp_path / "policy.onnx")])
 
 
+def test_the_model_may_be_named_without_its_ending(tmp_path: Path) -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY)
+    model.save(tmp_path / "model_0.5.zip")
+    model.save(tmp_path / "model_0.7")  # SB3 adds no ending where there is a dot
+    for name in ("model_0.5", "model_0.5.zip", "model_0.7"):
+        main([str(tmp_path / name), str(tmp_path / f"{name}.pt2")])
+        assert (tmp_path / f"{name}.pt2").is_file()
+    with pytest.raises(SystemExit, match=r"There is no file .*model_0\.9\.zip\."):
+        main([str(tmp_path / "model_0.9"), str(tmp_path / "policy.pt2")])
+
+
 class Double(gym.Env[Any, Any]):
     """Observations of float64, as MuJoCo's, far from zero."""
 

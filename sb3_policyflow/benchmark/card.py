@@ -17,6 +17,7 @@ from sb3_policyflow.benchmark.measure.evaluation import evaluate, modes
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.export import load_model
+from sb3_policyflow.resilience.files import saved_model
 
 MODES = {
     "stochastic": "actions drawn as in training",
@@ -43,7 +44,7 @@ def write_card(
     :raises BenchmarkError: If the environment does not exist, or the statistics are missing.
     """
     require_env(env_id)
-    model_path, folder = Path(model_path), Path(folder)
+    model_path, folder = saved_model(model_path), Path(folder)
     model = load_model(model_path)
     if statistics is None and model.observed().is_normalized is not False:
         raise BenchmarkError(
@@ -123,7 +124,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> int:
     """Write the folder."""
-    for file in (arguments.model, arguments.vecnormalize):
+    for file in (saved_model(arguments.model), arguments.vecnormalize):
         if file is not None and not file.is_file():
             raise BenchmarkError(f"There is no file {file}.")
     card = write_card(

@@ -8,6 +8,7 @@ from pathlib import Path
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow.export import export, load_model
+from sb3_policyflow.resilience.files import saved_model
 
 DESCRIPTION = "Write a policy to a file that runs without this package: ONNX, or torch alone."
 
@@ -50,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--latents", action="store_true", help="make the latents an input")
     options = parser.parse_args(arguments)
-    path = options.model if options.model.suffix else options.model.with_suffix(".zip")
+    path = saved_model(options.model)
     for file in (path, options.vecnormalize):
         if file is not None and not file.is_file():
             sys.exit(f"There is no file {file}.")

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_policyflow.hints import install_command
-from sb3_policyflow.resilience.files import atomic_write
+from sb3_policyflow.resilience.files import atomic_write, with_ending
 
 MINARI = "minari:"
 """What the name of a Minari dataset begins with where a file may be meant."""
@@ -47,9 +47,9 @@ class Demonstrations(NamedTuple):
     def save(self, path: str | Path) -> None:
         """Write them to a compressed ``.npz`` file, without their spaces.
 
-        :param path: The file.
+        :param path: The file; the ending may be left out.
         """
-        with atomic_write(path, suffix="npz") as file:
+        with atomic_write(with_ending(path, ".npz")) as file:
             np.savez_compressed(file, **self._arrays())
 
     def digest(self) -> str:

@@ -45,3 +45,15 @@ def test_the_statistics_belong_to_the_model(
     write_card(tmp_path / "m.zip", "Pendulum-v1", tmp_path / "card", tmp_path / "stats.pkl", 1)
     assert (tmp_path / "card" / "stats.pkl").is_file()
     assert main(["card", "nope.zip", "--env", "Pendulum-v1"]) == 2
+
+
+def test_the_model_may_be_named_without_its_ending(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY, **SMALL)
+    model.save(tmp_path / "model_0.5.zip")
+    command = ["--env", "Pendulum-v1", "--episodes", "1", "--out", str(tmp_path / "card")]
+    assert main(["card", str(tmp_path / "model_0.5"), *command]) == 0
+    assert (tmp_path / "card" / "model_0.5.zip").is_file()
+    assert main(["card", str(tmp_path / "model_0.7"), *command]) == 2
+    assert "model_0.7.zip" in capsys.readouterr().err

@@ -81,6 +81,18 @@ def test_without_a_state_the_file_of_statistics_decides() -> None:
 
 @THREE
 @pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("saved", ["model_0.5", "model_0.5.zip"])
+def test_a_dot_in_a_name_is_part_of_it(saved: str) -> None:
+    env = VecNormalize(wrapped())
+    PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=8).save(saved)
+    env.save("model_0.5_vecnormalize.pkl")
+    checkpoint = read_checkpoint(Path("model_0.5"), [])
+    assert checkpoint.path == Path(saved)
+    assert isinstance(checkpoint.statistics, VecNormalize)
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
 def test_a_model_brings_its_own_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the preset's: rollouts, what time limits are bootstrapped from, normalization."""
     made = []
