@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import configure_logger
 from sb3_policyflow.imitation.demonstrations import load_demonstrations
 from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
-from sb3_policyflow.imitation.samples import CloningSamples, take_up_statistics
+from sb3_policyflow.imitation.samples import CloningSamples
 from sb3_policyflow.imitation.training import CloningRun
 from sb3_policyflow.policyflow import PolicyFlowPolicy
 
@@ -74,13 +74,17 @@ def clone(
         same parameters to the last bit. It is written at each validation and removed at the end.
     :return: The model.
     :raises ValueError: If demonstrations or options cannot be used.
-    :raises TypeError: If there is no such option.
+    :raises TypeError: If there is no such option, or the model's algorithm is not on-policy.
     :raises FloatingPointError: If the loss is not finite.
     """
+    if not isinstance(model, OnPolicyAlgorithm):
+        raise TypeError(
+            f"{type(model).__name__} cannot be cloned from demonstrations, only on-policy "
+            "algorithms can: use PolicyFlow, FPO, DPPO, or PPO or A2C of Stable-Baselines3."
+        )
     chosen = CloningOptions.of(gradient_steps=gradient_steps, **options)
     shown = load_demonstrations(demonstrations)
     check_spaces(shown, model)
-    take_up_statistics(model.get_vec_normalize_env(), shown.observations)
     run = CloningRun(model, CloningSamples(model, shown), chosen)
     with _prepared(model, callback) as asked:
         run.train(asked, progress_bar)

@@ -57,10 +57,10 @@ class Demonstrations(NamedTuple):
         sha = hashlib.sha256()
         for name, array in sorted(self._arrays().items()):
             sha.update(f"{name} {array.dtype} {array.shape}".encode())
-            sha.update(np.ascontiguousarray(array))
+            sha.update(np.ascontiguousarray(array).data)
         return sha.hexdigest()
 
-    def _arrays(self) -> dict[str, np.ndarray]:
+    def _arrays(self) -> dict[str, Any]:
         is_dict = isinstance(self.observations, dict)
         parts = self.observations if is_dict else {"": self.observations}
         arrays = {f"observations{'/' if is_dict else ''}{key}": parts[key] for key in parts}

@@ -60,6 +60,7 @@ class CloningRun:
             self._train, self._held = self._samples.split(options.validation_fraction)
             self._validation_states = RandomStates.now(self._model.device)
             self._resume()
+            self._samples.take_up_statistics()  # not before what may refuse the cloning
             advance(self.step)
             while self.step < options.gradient_steps and not self._is_stuck():
                 self._take_step()

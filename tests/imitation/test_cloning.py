@@ -1,5 +1,6 @@
 """Cloning: what a model is after it, and how it may be interrupted."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
@@ -365,6 +366,29 @@ def test_options_that_cannot_be_used(options: dict[str, Any], what: str) -> None
 def test_an_option_that_does_not_exist() -> None:
     with pytest.raises(TypeError, match=r"clone has no argument 'steps'.*gradient_steps"):
         clone(pendulum(PolicyFlow), shown(), steps=10)
+
+
+def test_a_refusal_leaves_the_model_and_its_statistics_as_they_were(tmp_path: Path) -> None:
+    (tmp_path / "other").write_text("not the state of a cloning")
+    for algorithm, error, options in (
+        (SAC, TypeError, {}),
+        (PolicyFlow, TypeError, {"steps": 10}),
+        (PolicyFlow, ValueError, {"checkpoint": tmp_path / "other"}),
+    ):
+        env = VecNormalize(make_vec_env("Pendulum-v1"))
+        model = algorithm("MlpPolicy", env, seed=0)
+        before, statistics = weights(model), deepcopy(env.obs_rms)
+        with pytest.raises(error):
+            clone(model, shown(), **options)
+        assert th.equal(weights(model), before)
+        assert vars(env.obs_rms)["count"] == vars(statistics)["count"]
+        np.testing.assert_array_equal(vars(env.obs_rms)["mean"], vars(statistics)["mean"])
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TD3])
+def test_a_model_that_is_not_on_policy(algorithm: type[Any]) -> None:
+    with pytest.raises(TypeError, match=f"{algorithm.__name__} cannot be cloned .*use PolicyFlow"):
+        clone(algorithm("MlpPolicy", "Pendulum-v1"), shown())
 
 
 def test_observations_that_are_not_finite_stop_it() -> None:
