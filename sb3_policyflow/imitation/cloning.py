@@ -12,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_policyflow.flows.bounds import half_ranges
 from sb3_policyflow.imitation.demonstrations import load_demonstrations
 from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
@@ -21,7 +22,8 @@ from sb3_policyflow.policyflow import PolicyFlowPolicy
 
 Model = TypeVar("Model", bound=OnPolicyAlgorithm)
 DEFAULT_NOISE = 0.1
-"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds."""
+"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds; where there
+are none that mean something, as if they were -1 and 1."""
 
 
 def clone(
@@ -62,7 +64,8 @@ def clone(
     :param learning_rate: A number, "lin_START", "lin_START_END" or a function of the remaining
         progress. Default: "lin_0.001".
     :param noise_std: Standard deviation of PolicyFlow's noise when it has been cloned, which is
-        what it explores with; by default 0.1 where actions are from -1 to 1, and in proportion.
+        what it explores with; by default 0.1 where actions are from -1 to 1, and in proportion, or
+        0.1 where bounds are 200 or more apart, which seem to stand for none.
     :param validation_fraction: Part of the demonstrations that is held out, whole episodes if they
         are known; 0 for none. Default: 0.1.
     :param eval_freq: Gradient steps from one validation to the next. Default: 200.
@@ -110,7 +113,8 @@ def finish(model: Any, noise_std: float | None) -> None:
 
 def _set_noise(policy: PolicyFlowPolicy, noise_std: float | None) -> None:
     box: Any = policy.action_space
-    stds = DEFAULT_NOISE * (box.high - box.low).flatten() / 2
+    ranges = half_ranges(box.low, box.high)
+    stds = DEFAULT_NOISE * np.where(np.isfinite(ranges), ranges, 1.0)
     if noise_std is not None:
         stds = np.full_like(stds, noise_std)
     wanted = th.as_tensor(np.log(stds)).to(policy.log_std)

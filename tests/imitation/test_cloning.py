@@ -201,6 +201,32 @@ def test_the_noise_starts_small() -> None:
     assert model.policy.log_std.exp().item() == pytest.approx(0.25)
 
 
+class Moving(gym.Env[Any, Any]):
+    """Takes actions between some bounds."""
+
+    observation_space = spaces.Box(-1, 1, (3,))
+
+    def __init__(self, low: list[float], high: list[float]) -> None:
+        self.action_space = spaces.Box(np.float32(low), np.float32(high))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(3, np.float32), 0.0, True, False, {}
+
+
+def test_the_noise_of_bounds_that_mean_nothing_is_that_of_minus_one_and_one() -> None:
+    low, high = [-1, 0, -100, -3.4e38, 0.5], [1, 4, 100, 3.4e38, 0.5]
+    model = PolicyFlow("MlpPolicy", Moving(low, high), policy_kwargs=TINY, **SMALL)
+    observations, _ = shown()
+    clone(model, (observations, np.full((256, 5), 0.5)), **SHORT)
+    stds = model.policy.log_std.detach().exp().numpy()
+    np.testing.assert_allclose(stds, [0.1, 0.2, 0.1, 0.1, 1e-7], rtol=1e-5)
+    clone(model, (observations, np.full((256, 5), 0.5)), noise_std=0.3, **SHORT)
+    np.testing.assert_allclose(model.policy.log_std.detach().exp(), 0.3, rtol=1e-5)
+
+
 def test_bounds_of_the_noise_that_are_in_the_way_are_named() -> None:
     model = pendulum(PolicyFlow, policy_kwargs={"log_std_bounds": (-0.5, 2.0)})
     with pytest.warns(UserWarning, match="log_std_bounds"):
