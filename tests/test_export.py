@@ -273,6 +273,23 @@ def test_the_normalization_cannot_be_forgotten(tmp_path: Path) -> None:
         main([str(tmp_path / "again"), str(tmp_path / "policy.pt2")])
 
 
+def test_normalization_that_the_model_does_not_know_is_refused(tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env(Double, 2))
+    env.save(str(tmp_path / "stats.pkl"))
+    model = trained(PolicyFlow, "MlpPolicy", make_vec_env(Double, 2))
+    model.save(tmp_path / "model")
+    path = tmp_path / "policy.pt2"
+    with pytest.raises(ValueError, match=r"leave out normalize \(--vecnormalize\)"):
+        export(model, path, normalize=env)
+    command = [str(tmp_path / "model"), str(path)]
+    with pytest.raises(SystemExit, match=r"leave out normalize \(--vecnormalize\)"):
+        main([*command, "--vecnormalize", str(tmp_path / "stats.pkl")])
+    assert not path.exists()
+    (tmp_path / "text.pkl").write_text("text")
+    with pytest.raises(SystemExit, match=r"text\.pkl cannot be read as statistics"):
+        main([*command, "--vecnormalize", str(tmp_path / "text.pkl")])
+
+
 def test_rewards_alone_are_no_matter_of_the_policy(tmp_path: Path) -> None:
     model = trained(PolicyFlow, "MlpPolicy", VecNormalize(make_vec_env(Double, 2), norm_obs=False))
     model.save(tmp_path / "model")

@@ -1,6 +1,5 @@
 """Resuming from a saved model, with its own hyperparameters and normalization statistics."""
 
-import pickle
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_policyflow.integrations.isaaclab.lab import LabError
 from sb3_policyflow.policyflow import PolicyFlow
 from sb3_policyflow.resilience.files import saved_model
+from sb3_policyflow.resilience.normalization import read_statistics
 from sb3_policyflow.resilience.saving import ResumeState
 
 FOR_THE_SCRIPT = ("n_steps", "timeout_bootstrap", "seed")
@@ -107,11 +107,10 @@ def _read_statistics(checkpoint: Path, data: dict[str, Any]) -> VecNormalize | N
             f"{checkpoint} was trained with VecNormalize, but its statistics are not at {path}: "
             "copy them there."
         )
-    with _refused_if_unreadable(path), path.open("rb") as file:
-        statistics = pickle.load(file)
-    if not isinstance(statistics, VecNormalize):
-        raise LabError(f"{path} does not hold statistics of VecNormalize: copy them there.")
-    return statistics
+    try:
+        return read_statistics(path)
+    except ValueError as error:
+        raise LabError(str(error)) from error
 
 
 def statistics_of(checkpoint: Path) -> Path:

@@ -43,9 +43,9 @@ def test_lost_statistics_are_reported_before_the_simulator_starts(
     statistics.write_bytes(statistics.read_bytes()[:9])
     monkeypatch.setattr(lab, "check_task", lambda task, agent: pytest.fail("has started"))
     resumed = [*common, "--checkpoint", "out/model.zip"]
-    assert_refused(resumed, f"{statistics} cannot be resumed: ")
+    assert_refused(resumed, f"{statistics} cannot be read as statistics of VecNormalize")
     statistics.write_bytes(pickle.dumps({}))
-    assert_refused(resumed, f"{statistics} does not hold statistics of VecNormalize")
+    assert_refused(resumed, f"{statistics} holds a dict, no VecNormalize")
     statistics.unlink()
     assert_refused(
         resumed, f"trained with VecNormalize, but its statistics are not at {statistics}"
