@@ -231,6 +231,17 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
         main([str(tmp_path / "nope"), str(tmp_path / "policy.onnx")])
 
 
+def test_the_model_may_be_named_without_its_ending(tmp_path: Path) -> None:
+    model = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY)
+    model.save(tmp_path / "model_0.5.zip")
+    model.save(tmp_path / "model_0.7")  # SB3 adds no ending where there is a dot
+    for name in ("model_0.5", "model_0.5.zip", "model_0.7"):
+        main([str(tmp_path / name), str(tmp_path / f"{name}.pt2")])
+        assert (tmp_path / f"{name}.pt2").is_file()
+    with pytest.raises(SystemExit, match=r"There is no file .*model_0\.9\.zip\."):
+        main([str(tmp_path / "model_0.9"), str(tmp_path / "policy.pt2")])
+
+
 class Double(gym.Env[Any, Any]):
     """Observations of float64, as MuJoCo's, far from zero."""
 
@@ -260,6 +271,23 @@ def test_the_normalization_cannot_be_forgotten(tmp_path: Path) -> None:
     PolicyFlow.load(tmp_path / "model").save(tmp_path / "again")
     with pytest.raises(SystemExit, match="trained with VecNormalize"):
         main([str(tmp_path / "again"), str(tmp_path / "policy.pt2")])
+
+
+def test_normalization_that_the_model_does_not_know_is_refused(tmp_path: Path) -> None:
+    env = VecNormalize(make_vec_env(Double, 2))
+    env.save(str(tmp_path / "stats.pkl"))
+    model = trained(PolicyFlow, "MlpPolicy", make_vec_env(Double, 2))
+    model.save(tmp_path / "model")
+    path = tmp_path / "policy.pt2"
+    with pytest.raises(ValueError, match=r"leave out normalize \(--vecnormalize\)"):
+        export(model, path, normalize=env)
+    command = [str(tmp_path / "model"), str(path)]
+    with pytest.raises(SystemExit, match=r"leave out normalize \(--vecnormalize\)"):
+        main([*command, "--vecnormalize", str(tmp_path / "stats.pkl")])
+    assert not path.exists()
+    (tmp_path / "text.pkl").write_text("text")
+    with pytest.raises(SystemExit, match=r"text\.pkl cannot be read as statistics"):
+        main([*command, "--vecnormalize", str(tmp_path / "text.pkl")])
 
 
 def test_rewards_alone_are_no_matter_of_the_policy(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ BELOW: dict[str, set[str]] = {
         "callbacks",
         "distributed",
         "envs",
+        "flows",
         "hints",
         "imitation",
         "policyflow",

@@ -10,13 +10,16 @@ from typing import Any
 
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
 from sb3_policyflow.benchmark.measure.evaluation import evaluate, modes
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.report.markdown import markdown_table
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.export import load_model
+from sb3_policyflow.resilience.files import saved_model
+from sb3_policyflow.resilience.normalization import check_normalization, read_statistics
 
 MODES = {
     "stochastic": "actions drawn as in training",
@@ -40,19 +43,16 @@ def write_card(
     :param statistics: What ``VecNormalize.save`` wrote; needed if observations were normalized.
     :param n_episodes: Episodes of each way to act.
     :return: The model card.
-    :raises BenchmarkError: If the environment does not exist, or the statistics are missing.
+    :raises BenchmarkError: If the environment does not exist, the model cannot be loaded, or the
+        statistics are missing, of another environment, or not of the model's training.
     """
     require_env(env_id)
-    model_path, folder = Path(model_path), Path(folder)
-    model = load_model(model_path)
-    if statistics is None and model.observed().is_normalized is not False:
-        raise BenchmarkError(
-            f"{model_path} was trained with VecNormalize: give its statistics (--vecnormalize)."
-        )
-    env: VecEnv = make_vec_env(env_id, 1)
-    if statistics is not None:
-        env = VecNormalize.load(str(statistics), env)
-        env.training, env.norm_reward = False, False
+    model_path, folder = saved_model(model_path), Path(folder)
+    try:
+        model = load_model(model_path)
+        env = _environment(env_id, model, statistics)
+    except ValueError as error:
+        raise BenchmarkError(str(error)) from error
     evaluations = [evaluate(model, env, mode, n_episodes) for mode in modes(model)]
     env.close()
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,6 +63,26 @@ def write_card(
     name = type(model).__name__
     card.write_text(card_text(name, env_id, model_path.name, model, evaluations), encoding="utf-8")
     return card
+
+
+def _environment(
+    env_id: str, model: FlowOnPolicyAlgorithm, statistics: str | Path | None
+) -> VecEnv:
+    """The environment, as a model saw it in training."""
+    normalize = None if statistics is None else read_statistics(statistics)
+    check_normalization(model, normalize, "statistics")
+    env: VecEnv = make_vec_env(env_id, 1)
+    if normalize is None:
+        return env
+    try:
+        normalize.set_venv(env)
+    except AssertionError as error:
+        raise ValueError(
+            f"{statistics} is of another environment than {env_id} ({error}): give the statistics "
+            "of the model's training."
+        ) from error
+    normalize.training, normalize.norm_reward = False, False
+    return normalize
 
 
 def card_text(
@@ -123,7 +143,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> int:
     """Write the folder."""
-    for file in (arguments.model, arguments.vecnormalize):
+    for file in (saved_model(arguments.model), arguments.vecnormalize):
         if file is not None and not file.is_file():
             raise BenchmarkError(f"There is no file {file}.")
     card = write_card(

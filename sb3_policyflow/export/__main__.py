@@ -1,26 +1,14 @@
 """``python -m sb3_policyflow.export MODEL OUTPUT ...``."""
 
 import argparse
-import pickle
 import sys
 from pathlib import Path
 
-from stable_baselines3.common.vec_env import VecNormalize
-
 from sb3_policyflow.export import export, load_model
+from sb3_policyflow.resilience.files import saved_model
+from sb3_policyflow.resilience.normalization import read_statistics
 
 DESCRIPTION = "Write a policy to a file that runs without this package: ONNX, or torch alone."
-
-
-def _load_statistics(path: Path) -> VecNormalize:
-    """What ``VecNormalize.save`` wrote."""
-    try:
-        normalize = pickle.loads(path.read_bytes())
-    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError) as error:
-        raise ValueError(f"{path} cannot be read as VecNormalize's statistics: {error}") from error
-    if not isinstance(normalize, VecNormalize):
-        raise ValueError(f"{path} holds a {type(normalize).__name__}, not a VecNormalize.")
-    return normalize
 
 
 def _statistics_beside(model: Path) -> str:
@@ -50,12 +38,12 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--latents", action="store_true", help="make the latents an input")
     options = parser.parse_args(arguments)
-    path = options.model if options.model.suffix else options.model.with_suffix(".zip")
+    path = saved_model(options.model)
     for file in (path, options.vecnormalize):
         if file is not None and not file.is_file():
             sys.exit(f"There is no file {file}.")
     try:
-        statistics = options.vecnormalize and _load_statistics(options.vecnormalize)
+        statistics = options.vecnormalize and read_statistics(options.vecnormalize)
         model = load_model(path)
         export(model, options.output, statistics, options.latents, options.normalized_input)
     except (ValueError, ModuleNotFoundError) as error:

@@ -17,6 +17,12 @@ from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.export.modules import ActionModule
 from sb3_policyflow.hints import install_command
+from sb3_policyflow.resilience.normalization import check_normalization
+
+OR_NORMALIZED_INPUT = (
+    ", or say that the observations will be normalized already (normalized_input=True, "
+    "--normalized-input)"
+)
 
 
 def export(
@@ -40,8 +46,8 @@ def export(
     :param latents: Whether the latents z, shape (n, action_dim), are an input; otherwise they are
         those of the deterministic action.
     :param normalized_input: Whether the file takes observations that are normalized already.
-    :raises ValueError: If ``path`` has another suffix, or the normalization that a model was
-        trained with is missing.
+    :raises ValueError: If ``path`` has another suffix, or ``normalize`` is not what a model was
+        trained with: it is missing, or the model's observations were not normalized.
     :raises ModuleNotFoundError: If a package is missing that writes ".onnx" files.
     """
     path = Path(path)
@@ -52,15 +58,11 @@ def export(
     space = None
     if isinstance(policy, FlowOnPolicyAlgorithm):
         model, policy = policy, policy.policy
-        is_normalized, space = model.observed()
+        observed = model.observed()
+        space = None if observed is None else observed.space
         normalize = normalize or model.get_vec_normalize_env()
-        if is_normalized is not False and normalize is None and not normalized_input:
-            raise ValueError(
-                "The model was trained with VecNormalize, without whose statistics its actions "
-                "are wrong: give them as normalize (--vecnormalize FILE), or say that the "
-                "observations will be normalized already (normalized_input=True, "
-                "--normalized-input)."
-            )
+        if not normalized_input:
+            check_normalization(model, normalize, "normalize", OR_NORMALIZED_INPUT)
     module = ActionModule(policy, None if normalized_input else normalize, space).eval()
     example = module.example(latents)
     with th.no_grad(), _quiet():

@@ -17,6 +17,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from sb3_policyflow.resilience.files import with_ending
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Clone from the command line.
@@ -27,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     from rl_zoo3.utils import StoreDict
 
     options = _parser(StoreDict).parse_args(arguments)
-    out = Path(options.out).with_suffix(".zip")
+    out = with_ending(options.out, ".zip")
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as logs:
         manager = _experiment(options, out, logs)

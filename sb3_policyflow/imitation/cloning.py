@@ -12,16 +12,18 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_policyflow.flows.bounds import half_ranges
 from sb3_policyflow.imitation.demonstrations import load_demonstrations
 from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
-from sb3_policyflow.imitation.samples import CloningSamples, take_up_statistics
+from sb3_policyflow.imitation.samples import CloningSamples
 from sb3_policyflow.imitation.training import CloningRun
 from sb3_policyflow.policyflow import PolicyFlowPolicy
 
 Model = TypeVar("Model", bound=OnPolicyAlgorithm)
 DEFAULT_NOISE = 0.1
-"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds."""
+"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds; where there
+are none that mean something, as if they were -1 and 1."""
 
 
 def clone(
@@ -62,7 +64,8 @@ def clone(
     :param learning_rate: A number, "lin_START", "lin_START_END" or a function of the remaining
         progress. Default: "lin_0.001".
     :param noise_std: Standard deviation of PolicyFlow's noise when it has been cloned, which is
-        what it explores with; by default 0.1 where actions are from -1 to 1, and in proportion.
+        what it explores with; by default 0.1 where actions are from -1 to 1, and in proportion, or
+        0.1 where bounds are 200 or more apart, which seem to stand for none.
     :param validation_fraction: Part of the demonstrations that is held out, whole episodes if they
         are known; 0 for none. Default: 0.1.
     :param eval_freq: Gradient steps from one validation to the next. Default: 200.
@@ -74,13 +77,17 @@ def clone(
         same parameters to the last bit. It is written at each validation and removed at the end.
     :return: The model.
     :raises ValueError: If demonstrations or options cannot be used.
-    :raises TypeError: If there is no such option.
+    :raises TypeError: If there is no such option, or the model's algorithm is not on-policy.
     :raises FloatingPointError: If the loss is not finite.
     """
+    if not isinstance(model, OnPolicyAlgorithm):
+        raise TypeError(
+            f"{type(model).__name__} cannot be cloned from demonstrations, only on-policy "
+            "algorithms can: use PolicyFlow, FPO, DPPO, or PPO or A2C of Stable-Baselines3."
+        )
     chosen = CloningOptions.of(gradient_steps=gradient_steps, **options)
     shown = load_demonstrations(demonstrations)
     check_spaces(shown, model)
-    take_up_statistics(model.get_vec_normalize_env(), shown.observations)
     run = CloningRun(model, CloningSamples(model, shown), chosen)
     with _prepared(model, callback) as asked:
         run.train(asked, progress_bar)
@@ -106,7 +113,8 @@ def finish(model: Any, noise_std: float | None) -> None:
 
 def _set_noise(policy: PolicyFlowPolicy, noise_std: float | None) -> None:
     box: Any = policy.action_space
-    stds = DEFAULT_NOISE * (box.high - box.low).flatten() / 2
+    ranges = half_ranges(box.low, box.high)
+    stds = DEFAULT_NOISE * np.where(np.isfinite(ranges), ranges, 1.0)
     if noise_std is not None:
         stds = np.full_like(stds, noise_std)
     wanted = th.as_tensor(np.log(stds)).to(policy.log_std)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_policyflow.hints import install_command
-from sb3_policyflow.resilience.files import atomic_write
+from sb3_policyflow.resilience.files import atomic_write, with_ending
 
 MINARI = "minari:"
 """What the name of a Minari dataset begins with where a file may be meant."""
@@ -29,7 +30,6 @@ class Demonstrations(NamedTuple):
     :param actions: As the environment takes them, shape (n, ...).
     :param episodes: Number of the episode that each transition belongs to, shape (n,); None if it
         is not known. Validation then holds out transitions instead of whole episodes.
-    :param returns: Sum of rewards of each episode, shape (n_episodes,); None if it is not known.
     :param observation_space: Space of the observations; None to judge by the arrays alone.
     :param action_space: Space of the actions; None to judge by the arrays alone.
     """
@@ -37,7 +37,6 @@ class Demonstrations(NamedTuple):
     observations: Observations
     actions: np.ndarray
     episodes: np.ndarray | None = None
-    returns: np.ndarray | None = None
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
 
@@ -48,17 +47,27 @@ class Demonstrations(NamedTuple):
     def save(self, path: str | Path) -> None:
         """Write them to a compressed ``.npz`` file, without their spaces.
 
-        :param path: The file.
+        :param path: The file; the ending may be left out.
         """
+        with atomic_write(with_ending(path, ".npz")) as file:
+            np.savez_compressed(file, **self._arrays())
+
+    def digest(self) -> str:
+        """A hash of all arrays, by which the same demonstrations are known again."""
+        sha = hashlib.sha256()
+        for name, array in sorted(self._arrays().items()):
+            sha.update(f"{name} {array.dtype} {array.shape}".encode())
+            sha.update(np.ascontiguousarray(array).data)
+        return sha.hexdigest()
+
+    def _arrays(self) -> dict[str, Any]:
         is_dict = isinstance(self.observations, dict)
         parts = self.observations if is_dict else {"": self.observations}
         arrays = {f"observations{'/' if is_dict else ''}{key}": parts[key] for key in parts}
         arrays["actions"] = self.actions
-        for name in ("episodes", "returns"):
-            if getattr(self, name) is not None:
-                arrays[name] = getattr(self, name)
-        with atomic_write(path, suffix="npz") as file:
-            np.savez_compressed(file, **arrays)
+        if self.episodes is not None:
+            arrays["episodes"] = self.episodes
+        return arrays
 
 
 def rows(observations: Observations, indices: Any) -> Observations:
@@ -105,7 +114,7 @@ def _is_transitions(source: object) -> bool:
 
 
 def _checked(shown: Demonstrations) -> Demonstrations:
-    """Arrays of equal length, of which there is at least one transition."""
+    """Arrays of equal length, of which there is at least one transition, and finite actions."""
     observations = shown.observations
     if isinstance(observations, Mapping):
         observations = {key: np.asarray(values) for key, values in observations.items()}
@@ -123,7 +132,21 @@ def _checked(shown: Demonstrations) -> Demonstrations:
         raise ValueError(
             "Demonstrated actions must be finite numbers: leave out those that are not."
         )
-    return shown
+    if shown.episodes is None:
+        return shown
+    return shown._replace(episodes=_checked_episodes(shown.episodes, len(shown.actions)))
+
+
+def _checked_episodes(episodes: Any, n: int) -> np.ndarray:
+    """The number of the episode of each of n transitions."""
+    numbers = np.asarray(episodes)
+    if numbers.shape != (n,) or not np.issubdtype(numbers.dtype, np.integer):
+        raise ValueError(
+            f"The episodes of demonstrations must be {n} integers, for each transition the number "
+            f"of its episode, got an array of shape {numbers.shape} and dtype {numbers.dtype}: "
+            "correct it, or leave it out."
+        )
+    return numbers
 
 
 def _from_file(path: Path) -> Demonstrations:
@@ -131,19 +154,23 @@ def _from_file(path: Path) -> Demonstrations:
         raise ValueError(
             f"There are no demonstrations at {path}: give an .npz file, or '{MINARI}DATASET'."
         )
-    with np.load(path) as arrays:
-        kept = {name: arrays[name] for name in arrays.files}
-    parts = {name: kept.pop(name) for name in list(kept) if name.startswith("observations/")}
-    if parts:
-        prefix = len("observations/")
-        kept["observations"] = {name[prefix:]: values for name, values in parts.items()}
-    return Demonstrations(**kept)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    prefix = "observations/"
+    parts = {key.removeprefix(prefix): arrays[key] for key in arrays if key.startswith(prefix)}
+    observations = parts or arrays.get("observations")
+    if observations is None or "actions" not in arrays:
+        raise ValueError(
+            f"{path} has the arrays {sorted(arrays)}, but demonstrations are 'observations' and "
+            "'actions': give a file that Demonstrations.save wrote, or a pair of arrays."
+        )
+    # Whatever else is there is not needed: earlier files have returns too.
+    return Demonstrations(observations, arrays["actions"], arrays.get("episodes"))
 
 
 def _from_transitions(parts: list[Any]) -> Demonstrations:
     """Of objects with ``obs`` and ``acts``; trajectories have one observation more than actions."""
     observations, actions, episodes = [], [], []
-    have_rewards = all(hasattr(part, "rews") for part in parts)
     for number, part in enumerate(parts):
         acts = np.asarray(part.acts)
         observations.append(rows(_as_plain(part.obs), slice(len(acts))))
@@ -153,7 +180,6 @@ def _from_transitions(parts: list[Any]) -> Demonstrations:
         _concatenated(observations),
         np.concatenate(actions),
         np.concatenate(episodes) if len(parts) > 1 else None,
-        np.array([np.sum(part.rews) for part in parts]) if have_rewards else None,
     )
 
 
@@ -181,18 +207,16 @@ def from_minari(dataset: Any) -> Demonstrations:
     """
     if isinstance(dataset, str):
         dataset = import_minari().load_dataset(dataset, download=True)
-    observations, actions, episodes, returns = [], [], [], []
+    observations, actions, episodes = [], [], []
     for number, episode in enumerate(dataset.iterate_episodes()):
         acts = np.asarray(episode.actions)
         observations.append(rows(_as_plain(episode.observations), slice(len(acts))))
         actions.append(acts)
         episodes.append(np.full(len(acts), number))
-        returns.append(np.sum(episode.rewards))
     return Demonstrations(
         _concatenated(observations),
         np.concatenate(actions),
         np.concatenate(episodes),
-        np.array(returns),
         dataset.spec.observation_space,
         dataset.spec.action_space,
     )

@@ -55,8 +55,10 @@ class CloningOptions:
         return made
 
     def settings(self) -> dict[str, Any]:
-        """What a run must have in common with the one that it continues."""
-        return {
-            name: getattr(self, name)
-            for name in ("gradient_steps", "batch_size", "validation_fraction", "eval_freq", "seed")
-        }
+        """What a run must have in common with the one that it continues.
+
+        A learning rate that is a function cannot be compared, and counts as None.
+        """
+        names = ("gradient_steps", "batch_size", "validation_fraction", "eval_freq", "seed")
+        rate = None if callable(self.learning_rate) else self.learning_rate
+        return {**{name: getattr(self, name) for name in names}, "learning_rate": rate}

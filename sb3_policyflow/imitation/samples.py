@@ -27,6 +27,14 @@ class CloningSamples:
         self._normalize: VecNormalize | None = model.get_vec_normalize_env()
         self.n = len(shown.actions)
 
+    def take_up_statistics(self) -> None:
+        """Normalize by the moments of the demonstrations, if the model has none yet."""
+        take_up_statistics(self._normalize, self._shown.observations)
+
+    def digest(self) -> str:
+        """A hash of the demonstrations."""
+        return self._shown.digest()
+
     def batch(self, indices: np.ndarray) -> tuple[PyTorchObs, th.Tensor]:
         """Preprocessed observations and the policy's own actions of some transitions."""
         observations, actions = self._shown.take(indices)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ from sb3_policyflow.imitation.options import CloningOptions
 from sb3_policyflow.imitation.samples import CloningSamples
 from sb3_policyflow.resilience.files import atomic_write
 from sb3_policyflow.resilience.saving import RandomStates, preserve_rng_state
+
+PLAIN = (bool, int, float, str, tuple, type(None))
+"""Types of a policy's options that are compared when a cloning continues."""
 
 
 class CloningRun:
@@ -56,6 +60,7 @@ class CloningRun:
             self._train, self._held = self._samples.split(options.validation_fraction)
             self._validation_states = RandomStates.now(self._model.device)
             self._resume()
+            self._samples.take_up_statistics()  # not before what may refuse the cloning
             advance(self.step)
             while self.step < options.gradient_steps and not self._is_stuck():
                 self._take_step()
@@ -65,6 +70,8 @@ class CloningRun:
                     self._write()
                 if not callback.on_step():
                     break
+            if self._losses:  # of steps since the last validation: a callback has stopped it
+                self._validate()
         self._policy.load_state_dict(self._best)
         self._policy.set_training_mode(False)
         if options.checkpoint is not None:
@@ -144,10 +151,15 @@ class CloningRun:
 
     # The state of a run in its file
 
+    @cached_property
     def _settings(self) -> dict[str, Any]:
+        """What this run must have in common with the one that it continues."""
+        made_with = self._policy._get_constructor_parameters()
         return {
             **self._options.settings(),
-            "n": self._samples.n,
+            "demonstrations": self._samples.digest(),
+            "policy": type(self._policy).__name__,
+            "policy_kwargs": {k: v for k, v in made_with.items() if isinstance(v, PLAIN)},
             "parameters": {name: list(v.shape) for name, v in self._policy.state_dict().items()},
         }
 
@@ -155,7 +167,7 @@ class CloningRun:
         if self._options.checkpoint is None:
             return
         state = {
-            "settings": self._settings(),
+            "settings": self._settings,
             "policy": self._policy.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "best": (self._best, self.best_loss, self.best_step),
@@ -170,17 +182,16 @@ class CloningRun:
     def _resume(self) -> None:
         """Continue from the file, if there is one.
 
-        :raises ValueError: If another cloning wrote it.
+        :raises ValueError: If another cloning wrote it, or no cloning at all.
         """
         path = self._options.checkpoint
         if path is None or not Path(path).is_file():
             return
-        # The states of random generators belong on the CPU, and the others find their device.
-        state = th.load(path, map_location="cpu", weights_only=False)
-        if state["settings"] != self._settings():
+        state = _read(path)
+        if state.get("settings") != self._settings:
             raise ValueError(
-                f"{path} is of a cloning with other options, demonstrations or networks: delete "
-                "it, or name another checkpoint."
+                f"{path} is not the state of a cloning with these options, demonstrations and "
+                "networks: name another checkpoint, or delete it."
             )
         self._policy.load_state_dict(state["policy"])
         self._optimizer.load_state_dict(state["optimizer"])
@@ -189,6 +200,16 @@ class CloningRun:
         self._train, self._held = state["split"]
         states, self._validation_states = state["random"]
         states.restore(self._model.device)
+
+
+def _read(path: str | Path) -> dict[str, Any]:
+    """The state in a file; an empty one if the file is of another kind, or cannot be read."""
+    try:
+        # The states of random generators belong on the CPU, and the others find their device.
+        state = th.load(path, map_location="cpu", weights_only=False)
+    except Exception:  # a pickle may raise anything
+        return {}
+    return state if isinstance(state, dict) else {}
 
 
 @contextmanager

@@ -292,12 +292,17 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             model._saved_random_states = state.random_states
         return model
 
-    def observed(self) -> Observed:
-        """What the policy observed in training: whether it was normalized, and the space before."""
+    def observed(self) -> Observed | None:
+        """What the policy observed in training: whether it was normalized, and the space before.
+
+        :return: None if neither an environment nor a file says.
+        """
         normalize = self.get_vec_normalize_env()
         if normalize is not None:
             return Observed(normalize.norm_obs, normalize.venv.observation_space)
-        return self._saved_observed or Observed(False, self.observation_space)
+        if self._saved_observed is None and self.env is not None:
+            return Observed(False, self.observation_space)
+        return self._saved_observed
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed the generators; see SB3. Those that ``load`` has found are forgotten.

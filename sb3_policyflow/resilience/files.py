@@ -14,6 +14,29 @@ from typing import IO, Any
 from stable_baselines3.common.save_util import open_path
 
 
+def with_ending(path: str | Path, ending: str) -> Path:
+    """The path, with an ending that its name may lack: what follows another dot is of the name.
+
+    >>> [with_ending(name, ".zip").name for name in ("model", "noise0.3", "noise0.3.zip")]
+    ['model.zip', 'noise0.3.zip', 'noise0.3.zip']
+
+    :param path: A path as a user gives it.
+    :param ending: The ending, with its dot.
+    """
+    return Path(path) if str(path).endswith(ending) else Path(f"{path}{ending}")
+
+
+def saved_model(path: str | Path) -> Path:
+    """The file of a saved model, whose name may be given without its ``.zip``.
+
+    SB3 gives no ending to a name with a dot, so that the name may also be the whole.
+
+    :param path: A path as a user gives it.
+    :return: The file, which need not exist.
+    """
+    return Path(path) if Path(path).is_file() else with_ending(path, ".zip")
+
+
 @contextmanager
 def atomic_write(path: str | Path, suffix: str = "") -> Iterator[IO[bytes]]:
     """A file to write, which takes the place of ``path`` at the end of the block, or never.

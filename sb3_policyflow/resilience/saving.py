@@ -87,7 +87,7 @@ class ResumeState(NamedTuple):
         return states[rank] if rank < len(states) else None
 
     def what_was_observed(self) -> Observed | None:
-        """What the policy observed; None if it was what the policy's own space says."""
+        """What the policy observed; None if the file does not say whether there was a wrapper."""
         if self.observed is None and self.normalized_returns is not None:
             return Observed(None, None)
         return self.observed

@@ -1,5 +1,6 @@
 """Cloning: what a model is after it, and how it may be interrupted."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
@@ -16,7 +17,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
-from sb3_policyflow.imitation import clone
+from sb3_policyflow.imitation import Demonstrations, clone
 from tests.helpers import SMALL, TINY, learned, weights
 from tests.imitation.short import ALGORITHMS, SHORT, pendulum, shown
 
@@ -77,12 +78,88 @@ def test_an_interrupted_cloning_continues_to_the_last_bit(
     assert not checkpoint.exists()
 
 
-def test_a_checkpoint_of_another_cloning_is_refused(tmp_path: Path) -> None:
-    options = {**SHORT, "checkpoint": tmp_path / "state"}
+def interrupted(model: Any, demonstrations: Any, **options: Any) -> Path:
+    """The checkpoint of a cloning that was interrupted after its second validation."""
     with pytest.raises(KeyboardInterrupt):
-        clone(pendulum(FPO), shown(), callback=Interruption(20), **options)
-    with pytest.raises(ValueError, match="delete it, or name another checkpoint"):
-        clone(pendulum(FPO), shown(300), **options)
+        clone(model, demonstrations, callback=Interruption(20), **options)
+    return Path(options["checkpoint"])
+
+
+def numbered(n_episodes: int = 4) -> Demonstrations:
+    observations, actions = shown()
+    return Demonstrations(observations, actions, np.arange(256) % n_episodes)
+
+
+@pytest.mark.parametrize(
+    "demonstrations",
+    [
+        Demonstrations(*shown(300)),
+        Demonstrations(*shown()),
+        numbered(5),
+        numbered()._replace(actions=-numbered().actions),
+        numbered()._replace(observations=numbered().observations + 1e-3),
+    ],
+    ids=["more of them", "without episodes", "other episodes", "other actions", "other places"],
+)
+def test_a_checkpoint_of_other_demonstrations_is_refused(
+    demonstrations: Demonstrations, tmp_path: Path
+) -> None:
+    options = {**SHORT, "checkpoint": tmp_path / "state"}
+    interrupted(pendulum(FPO), numbered(), **options)
+    with pytest.raises(ValueError, match="name another checkpoint, or delete it"):
+        clone(pendulum(FPO), demonstrations, **options)
+    clone(pendulum(FPO), numbered(), **options)
+
+
+def test_other_dictionaries_are_other_demonstrations() -> None:
+    one, two = (Demonstrations({"a": np.zeros((2, 1)), "b": x}, np.ones((2, 1))) for x in np.eye(2))
+    renamed = Demonstrations({"b": np.zeros((2, 1)), "a": np.eye(2)[0]}, np.ones((2, 1)))
+    digests = [shown.digest() for shown in (one, two, renamed)]
+    assert len(set(digests)) == 3
+    again = Demonstrations({"b": np.eye(2)[0], "a": np.zeros((2, 1))}, np.ones((2, 1)))
+    assert again.digest() == one.digest()
+
+
+@pytest.mark.parametrize(
+    ("options", "model"),
+    [
+        ({"learning_rate": 1e-4}, {}),
+        ({"learning_rate": lambda _: 1e-3}, {}),
+        ({"batch_size": 16}, {}),
+        ({}, {"algorithm": DPPO}),
+        ({}, {"n_flow_steps": 3}),
+        ({}, {"policy_kwargs": {"net_arch": [9]}}),
+    ],
+    ids=str,
+)
+def test_a_checkpoint_of_other_options_or_networks_is_refused(
+    options: dict[str, Any], model: dict[str, Any], tmp_path: Path
+) -> None:
+    same = {**SHORT, "learning_rate": 1e-3, "checkpoint": tmp_path / "state"}
+    interrupted(pendulum(FPO), shown(), **same)
+    with pytest.raises(ValueError, match="name another checkpoint, or delete it"):
+        clone(pendulum(**{"algorithm": FPO, **model}), shown(), **{**same, **options})
+
+
+def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
+    options = {**SHORT, "checkpoint": tmp_path / "state"}
+    state = th.load(interrupted(pendulum(FPO), shown(), **options), weights_only=False)
+    names = ("gradient_steps", "batch_size", "validation_fraction", "eval_freq", "seed")
+    earlier = {name: state["settings"][name] for name in names}
+    earlier |= {"n": 256, "parameters": state["settings"]["parameters"]}
+    for name, content in {
+        "earlier": {**state, "settings": earlier},
+        "weights": {"weights": 1},
+        "list": [1],
+    }.items():
+        th.save(content, tmp_path / name)
+    pendulum(FPO).save(tmp_path / "model.zip")
+    (tmp_path / "text").write_bytes(b"text")
+    (tmp_path / "empty").touch()
+    for name in ("earlier", "weights", "list", "model.zip", "text", "empty"):
+        with pytest.raises(ValueError, match=f"{name} is not the state .* or delete it"):
+            clone(pendulum(FPO), shown(), **{**SHORT, "checkpoint": tmp_path / name})
+        assert (tmp_path / name).is_file()
 
 
 def test_training_goes_on_with_the_same_numbers_after_a_file(tmp_path: Path) -> None:
@@ -124,6 +201,32 @@ def test_the_noise_starts_small() -> None:
     assert model.policy.log_std.exp().item() == pytest.approx(0.25)
 
 
+class Moving(gym.Env[Any, Any]):
+    """Takes actions between some bounds."""
+
+    observation_space = spaces.Box(-1, 1, (3,))
+
+    def __init__(self, low: list[float], high: list[float]) -> None:
+        self.action_space = spaces.Box(np.float32(low), np.float32(high))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(3, np.float32), 0.0, True, False, {}
+
+
+def test_the_noise_of_bounds_that_mean_nothing_is_that_of_minus_one_and_one() -> None:
+    low, high = [-1, 0, -100, -3.4e38, 0.5], [1, 4, 100, 3.4e38, 0.5]
+    model = PolicyFlow("MlpPolicy", Moving(low, high), policy_kwargs=TINY, **SMALL)
+    observations, _ = shown()
+    clone(model, (observations, np.full((256, 5), 0.5)), **SHORT)
+    stds = model.policy.log_std.detach().exp().numpy()
+    np.testing.assert_allclose(stds, [0.1, 0.2, 0.1, 0.1, 1e-7], rtol=1e-5)
+    clone(model, (observations, np.full((256, 5), 0.5)), noise_std=0.3, **SHORT)
+    np.testing.assert_allclose(model.policy.log_std.detach().exp(), 0.3, rtol=1e-5)
+
+
 def test_bounds_of_the_noise_that_are_in_the_way_are_named() -> None:
     model = pendulum(PolicyFlow, policy_kwargs={"log_std_bounds": (-0.5, 2.0)})
     with pytest.warns(UserWarning, match="log_std_bounds"):
@@ -163,15 +266,24 @@ def test_the_best_parameters_are_kept_and_cloning_stops_early() -> None:
     assert all(th.isfinite(parameter).all() for parameter in learned(model.policy))
 
 
-def test_a_callback_stops_it() -> None:
+@pytest.mark.parametrize("validation_fraction", [0.0, 0.1])
+@pytest.mark.parametrize("n_steps", [7, 17, 20])
+def test_a_callback_stops_it_and_what_was_learned_is_kept(
+    n_steps: int, validation_fraction: float
+) -> None:
+    """Before the first validation, between two of them, and at one."""
     steps: list[int] = []
 
     def stop(*_: Any) -> bool:
         steps.append(1)
-        return len(steps) < 7
+        return len(steps) < n_steps
 
-    clone(pendulum(FPO), shown(), callback=stop, **SHORT)
-    assert len(steps) == 7
+    options = {**SHORT, "learning_rate": 1e-3, "validation_fraction": validation_fraction}
+    stopped = clone(pendulum(FPO), shown(), callback=stop, **options)
+    assert len(steps) == n_steps
+    short = clone(pendulum(FPO), shown(), **{**options, "gradient_steps": n_steps})
+    assert th.equal(weights(stopped), weights(short))
+    assert not th.equal(weights(stopped), weights(pendulum(FPO)))
 
 
 def test_callbacks_save_and_logs_are_written(tmp_path: Path) -> None:
@@ -280,6 +392,29 @@ def test_options_that_cannot_be_used(options: dict[str, Any], what: str) -> None
 def test_an_option_that_does_not_exist() -> None:
     with pytest.raises(TypeError, match=r"clone has no argument 'steps'.*gradient_steps"):
         clone(pendulum(PolicyFlow), shown(), steps=10)
+
+
+def test_a_refusal_leaves_the_model_and_its_statistics_as_they_were(tmp_path: Path) -> None:
+    (tmp_path / "other").write_text("not the state of a cloning")
+    for algorithm, error, options in (
+        (SAC, TypeError, {}),
+        (PolicyFlow, TypeError, {"steps": 10}),
+        (PolicyFlow, ValueError, {"checkpoint": tmp_path / "other"}),
+    ):
+        env = VecNormalize(make_vec_env("Pendulum-v1"))
+        model = algorithm("MlpPolicy", env, seed=0)
+        before, statistics = weights(model), deepcopy(env.obs_rms)
+        with pytest.raises(error):
+            clone(model, shown(), **options)
+        assert th.equal(weights(model), before)
+        assert vars(env.obs_rms)["count"] == vars(statistics)["count"]
+        np.testing.assert_array_equal(vars(env.obs_rms)["mean"], vars(statistics)["mean"])
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TD3])
+def test_a_model_that_is_not_on_policy(algorithm: type[Any]) -> None:
+    with pytest.raises(TypeError, match=f"{algorithm.__name__} cannot be cloned .*use PolicyFlow"):
+        clone(algorithm("MlpPolicy", "Pendulum-v1"), shown())
 
 
 def test_observations_that_are_not_finite_stop_it() -> None:

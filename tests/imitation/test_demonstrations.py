@@ -57,8 +57,6 @@ def test_transitions() -> None:
     np.testing.assert_array_equal(shown.actions, np.concatenate([part.acts for part in parts]))
     assert shown.episodes is not None
     assert shown.episodes.tolist() == [0] * 5 + [1] * 3
-    assert shown.returns is not None
-    assert shown.returns.tolist() == [5, 3]
     single = load_demonstrations(parts[0])
     assert single.episodes is None
     assert len(single.actions) == 5
@@ -68,13 +66,51 @@ def test_a_file(tmp_path: Path) -> None:
     shown = load_demonstrations(trajectories())
     shown.save(tmp_path / "shown.npz")
     again = load_demonstrations(tmp_path / "shown.npz")
-    for name in ("observations", "actions", "episodes", "returns"):
+    for name in ("observations", "actions", "episodes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(shown, name))
     observations = {"a": np.zeros((4, 2)), "b": np.ones((4, 3))}
     Demonstrations(observations, np.zeros((4, 1))).save(tmp_path / "dict.npz")
     loaded = load_demonstrations(str(tmp_path / "dict.npz"))
     assert loaded.observations.keys() == observations.keys()
     np.testing.assert_array_equal(loaded.observations["b"], observations["b"])
+
+
+def test_a_file_of_an_earlier_version_had_returns(tmp_path: Path) -> None:
+    arrays = {"observations": np.ones((4, 2)), "actions": np.zeros((4, 1))}
+    np.savez(tmp_path / "old.npz", **arrays, episodes=np.arange(4), returns=np.ones(4))
+    shown = load_demonstrations(tmp_path / "old.npz")
+    np.testing.assert_array_equal(shown.observations, arrays["observations"])
+    assert shown.episodes is not None
+    assert shown.episodes.tolist() == [0, 1, 2, 3]
+
+
+def test_a_file_of_something_else(tmp_path: Path) -> None:
+    np.savez(tmp_path / "rollout.npz", observations=np.ones((4, 2)), rewards=np.ones(4))
+    with pytest.raises(ValueError, match=r"has the arrays \['observations', 'rewards'\]"):
+        load_demonstrations(tmp_path / "rollout.npz")
+
+
+@pytest.mark.parametrize(
+    "episodes",
+    [
+        np.arange(100),
+        np.arange(400),
+        np.zeros((300, 1), dtype=int),
+        np.zeros(300),
+        np.zeros(300, dtype=bool),
+    ],
+    ids=["too few", "too many", "a column", "floats", "booleans"],
+)
+def test_episodes_that_do_not_belong_to_the_transitions(episodes: np.ndarray) -> None:
+    demonstrations = Demonstrations(np.zeros((300, 3)), np.zeros((300, 1)), episodes)
+    with pytest.raises(ValueError, match="episodes of demonstrations must be 300 integers"):
+        load_demonstrations(demonstrations)
+
+
+def test_episodes_may_be_a_list_of_any_numbers() -> None:
+    shown = load_demonstrations(Demonstrations(np.zeros((3, 3)), np.zeros((3, 1)), [7, 7, -1]))  # type: ignore[arg-type]
+    assert shown.episodes is not None
+    assert shown.episodes.tolist() == [7, 7, -1]
 
 
 @pytest.mark.parametrize(
@@ -239,7 +275,6 @@ def test_minari_keeps_episodes() -> None:
         np.testing.assert_array_equal(shown.observations, direct.observations)
         np.testing.assert_array_equal(shown.actions, direct.actions)
         np.testing.assert_array_equal(shown.episodes, direct.episodes)
-        np.testing.assert_allclose(shown.returns, direct.returns)
         assert shown.action_space == env.action_space
     assert dataset.recover_environment().spec.id == "MultiGoal-v0"
     model = PolicyFlow("MlpPolicy", "Pendulum-v1", policy_kwargs=TINY, **SMALL)

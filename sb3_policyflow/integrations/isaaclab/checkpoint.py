@@ -1,6 +1,5 @@
 """Resuming from a saved model, with its own hyperparameters and normalization statistics."""
 
-import pickle
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_policyflow.integrations.isaaclab.lab import LabError
 from sb3_policyflow.policyflow import PolicyFlow
+from sb3_policyflow.resilience.files import saved_model
+from sb3_policyflow.resilience.normalization import read_statistics
 from sb3_policyflow.resilience.saving import ResumeState
 
 FOR_THE_SCRIPT = ("n_steps", "timeout_bootstrap", "seed")
@@ -38,7 +39,7 @@ def read_checkpoint(path: Path, overrides: Sequence[str]) -> Checkpoint:
     :raises LabError: If it or its statistics cannot be loaded, or its hyperparameters are to be
         changed.
     """
-    path = find_checkpoint(path)
+    path = _found(path)
     changes = [change for change in overrides if _is_of_the_model(change)]
     if changes:
         raise LabError(
@@ -52,15 +53,15 @@ def read_checkpoint(path: Path, overrides: Sequence[str]) -> Checkpoint:
     return Checkpoint(path, hyperparameters, _read_statistics(path, data or {}))
 
 
-def find_checkpoint(path: Path) -> Path:
-    """The file of a saved model, whose name may be given without its ``.zip``.
+def _found(path: Path) -> Path:
+    """The file of a saved model.
 
     :raises LabError: If there is none.
     """
-    for candidate in (path, path.with_name(f"{path.name}.zip")):
-        if candidate.is_file():
-            return candidate
-    raise LabError(f"There is no model {path} to resume from: correct --checkpoint.")
+    file = saved_model(path)
+    if not file.is_file():
+        raise LabError(f"There is no model {path} to resume from: correct --checkpoint.")
+    return file
 
 
 def _is_of_the_model(override: str) -> bool:
@@ -106,11 +107,10 @@ def _read_statistics(checkpoint: Path, data: dict[str, Any]) -> VecNormalize | N
             f"{checkpoint} was trained with VecNormalize, but its statistics are not at {path}: "
             "copy them there."
         )
-    with _refused_if_unreadable(path), path.open("rb") as file:
-        statistics = pickle.load(file)
-    if not isinstance(statistics, VecNormalize):
-        raise LabError(f"{path} does not hold statistics of VecNormalize: copy them there.")
-    return statistics
+    try:
+        return read_statistics(path)
+    except ValueError as error:
+        raise LabError(str(error)) from error
 
 
 def statistics_of(checkpoint: Path) -> Path:
@@ -118,8 +118,9 @@ def statistics_of(checkpoint: Path) -> Path:
 
     >>> statistics_of(Path("logs/model_98304_steps.zip")).name
     'model_vecnormalize_98304_steps.pkl'
-    >>> statistics_of(Path("logs/model.zip")).name
-    'model_vecnormalize.pkl'
+    >>> [statistics_of(Path(name)).name for name in ("logs/model.zip", "logs/model_0.5")]
+    ['model_vecnormalize.pkl', 'model_0.5_vecnormalize.pkl']
     """
-    name = re.sub(r"(_\d+_steps)?$", r"_vecnormalize\1", checkpoint.stem, count=1)
+    model = checkpoint.name.removesuffix(".zip")
+    name = re.sub(r"(_\d+_steps)?$", r"_vecnormalize\1", model, count=1)
     return checkpoint.with_name(f"{name}.pkl")

@@ -3,8 +3,6 @@
 import warnings
 from typing import Any
 
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
 from sb3_policyflow.imitation import clone
 
 
@@ -51,7 +49,10 @@ class CloningBeforeTraining:
         return self._preprocess(hyperparams)
 
     def setup(self) -> Any:
-        """What rl_zoo3 sets up, with a model that has been cloned."""
+        """What rl_zoo3 sets up, with a model that has been cloned.
+
+        :raises SystemExit: If ``clone`` refuses the model, the demonstrations or its arguments.
+        """
         made = self._setup()
         if made is None or self._demonstrations is None:
             return made
@@ -63,11 +64,9 @@ class CloningBeforeTraining:
                 stacklevel=2,
             )
             return made
-        if not isinstance(model, OnPolicyAlgorithm):
-            raise ValueError(
-                f"{type(model).__name__} cannot be cloned from demonstrations, only on-policy "
-                "algorithms can: leave out demonstrations."
-            )
         options = {"progress_bar": self._manager.show_progress, **self._options}
-        clone(model, self._demonstrations, **options)
+        try:
+            clone(model, self._demonstrations, **options)
+        except (TypeError, ValueError) as error:
+            raise SystemExit(str(error)) from error
         return made

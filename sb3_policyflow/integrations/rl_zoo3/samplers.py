@@ -14,6 +14,8 @@ from gymnasium import spaces
 from optuna import Trial
 from torch import nn
 
+from sb3_policyflow.flows.bounds import half_ranges
+
 NET_ARCHS = {
     "tiny": [64],
     "small": [64, 64],
@@ -35,7 +37,7 @@ class Task(NamedTuple):
     """What a search space depends on and rl_zoo3 does not hand on.
 
     ``n_timesteps`` are those of a trial, None if not known. ``action_scale`` is the mean half width
-    of the action space; 1 where actions have no bounds.
+    of the dimensions of the action space that have bounds which mean something; 1 if none has.
     """
 
     n_timesteps: int | None = None
@@ -44,9 +46,11 @@ class Task(NamedTuple):
     @classmethod
     def of(cls, n_timesteps: int, action_space: spaces.Space[Any]) -> "Task":
         """The task of trainings of some length with actions of this space."""
-        if not isinstance(action_space, spaces.Box) or not action_space.is_bounded():
+        if not isinstance(action_space, spaces.Box):
             return cls(n_timesteps)
-        return cls(n_timesteps, float(np.mean((action_space.high - action_space.low) / 2)))
+        ranges = half_ranges(action_space.low, action_space.high)
+        bounded = ranges[np.isfinite(ranges)]
+        return cls(n_timesteps, float(bounded.mean()) if len(bounded) else 1.0)
 
 
 UNKNOWN_TASK = Task()

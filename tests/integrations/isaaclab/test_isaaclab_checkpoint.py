@@ -43,9 +43,9 @@ def test_lost_statistics_are_reported_before_the_simulator_starts(
     statistics.write_bytes(statistics.read_bytes()[:9])
     monkeypatch.setattr(lab, "check_task", lambda task, agent: pytest.fail("has started"))
     resumed = [*common, "--checkpoint", "out/model.zip"]
-    assert_refused(resumed, f"{statistics} cannot be resumed: ")
+    assert_refused(resumed, f"{statistics} cannot be read as statistics of VecNormalize")
     statistics.write_bytes(pickle.dumps({}))
-    assert_refused(resumed, f"{statistics} does not hold statistics of VecNormalize")
+    assert_refused(resumed, f"{statistics} holds a dict, no VecNormalize")
     statistics.unlink()
     assert_refused(
         resumed, f"trained with VecNormalize, but its statistics are not at {statistics}"
@@ -77,6 +77,18 @@ def test_without_a_state_the_file_of_statistics_decides() -> None:
     assert read_checkpoint(Path("model"), []).statistics is None
     env.save("model_vecnormalize.pkl")
     assert isinstance(read_checkpoint(Path("model"), []).statistics, VecNormalize)
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("saved", ["model_0.5", "model_0.5.zip"])
+def test_a_dot_in_a_name_is_part_of_it(saved: str) -> None:
+    env = VecNormalize(wrapped())
+    PolicyFlow("MlpPolicy", env, n_steps=8, batch_size=8).save(saved)
+    env.save("model_0.5_vecnormalize.pkl")
+    checkpoint = read_checkpoint(Path("model_0.5"), [])
+    assert checkpoint.path == Path(saved)
+    assert isinstance(checkpoint.statistics, VecNormalize)
 
 
 @THREE

@@ -132,4 +132,18 @@ def test_the_spread_is_drawn_on_the_scale_of_the_actions() -> None:
     coefs = np.array([params["brownian_coef"] for params in drawn], dtype=float)
     assert 1e-4 <= coefs.min() < 1e-3
     assert 0.1 < coefs.max() <= 0.5
-    assert Task.of(10, spaces.Box(-np.inf, np.inf, (3,))).action_scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("half_widths", "scale"),
+    [
+        ([np.inf, np.inf], 1.0),
+        ([100.0, 3.4e38], 1.0),
+        ([2.0, 4.0, 100.0, 3.4e38, np.inf], 3.0),
+        ([0.0, 1.0], 0.5),
+    ],
+)
+def test_bounds_that_mean_nothing_have_no_scale(half_widths: list[float], scale: float) -> None:
+    bounds = np.array(half_widths, dtype=np.float32)
+    task = Task.of(10, spaces.Box(-bounds, bounds))
+    assert task.action_scale == pytest.approx(scale, rel=1e-5)
