@@ -1,7 +1,6 @@
 """Train algorithms in environments with several seeds; what has been run is not run again."""
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -9,7 +8,6 @@ import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +39,7 @@ def run_all(
     :param n_threads: Threads of each.
     :param agents: Where trained agents go; None to keep none.
     :return: The runs that failed.
-    :raises BenchmarkError: If one has been run with other settings.
+    :raises BenchmarkError: If one has been run with other settings, or could not be written.
     """
     runs = list(runs)
     missing = [run for run in runs if not run.is_done(folder)]
@@ -104,7 +102,7 @@ def _succeeds(run: Run, folder: Path, n_threads: int, agents: Path | None) -> bo
     log = run.path(folder, ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "sb3_policyflow.benchmark", "train-one"]
-    command += [json.dumps(asdict(run)), str(folder), "--threads", str(n_threads)]
+    command += [run.as_json(), str(folder), "--threads", str(n_threads)]
     command += [] if agents is None else ["--agents", str(agents)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(n_threads))
     with open(log, "w", encoding="utf-8") as file:

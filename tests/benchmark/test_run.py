@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,36 @@ def test_a_misspelt_hyperparameter_is_refused_before_a_training(
         with pytest.raises(SystemExit, match=r"no hyperparameter 'n_epoch': did you mean n_epochs"):
             main(["run", *settings, "--algos", algo, "--hyperparams", f"{name}:4"])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_hyperparameter_without_json_is_refused_before_a_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--envs", "Pendulum-v1", "--steps", "10", "--out", str(tmp_path), "--algos", "ppo"]
+    assert main(["run", *settings, "--hyperparams", "policy_kwargs:dict(a=dict)"]) == 2
+    said = capsys.readouterr().err
+    assert "policy_kwargs:{'a': <class 'dict'>} cannot be written to a JSON file" in said
+    assert "\"policy_kwargs:'dict(...)'\"" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_hyperparameters_are_the_same_after_saving(tmp_path: Path) -> None:
+    """JSON has lists alone, and a file may be older than the newest field of a run."""
+    made = Run("a", "ppo", "Env-v0", 3, 10, {"log_std_bounds": (-2.0, 0.0), "kwargs": {"a": (1,)}})
+    Result(made, {"final": {}}, []).save(tmp_path)
+    assert made.is_done(tmp_path)
+    path = made.path(tmp_path, ".json")
+    kept = json.loads(path.read_text())
+    del kept["run"]["keep_visits"]
+    path.write_text(json.dumps(kept))
+    assert made.is_done(tmp_path)
+    assert load_results(tmp_path)[0].run.keep_visits is False
+    with pytest.raises(BenchmarkError, match="was made with other settings"):
+        replace(made, hyperparams={"log_std_bounds": (-1.0, 0.0)}).is_done(tmp_path)
+    kept["run"]["newer"] = 1
+    path.write_text(json.dumps(kept))
+    with pytest.raises(BenchmarkError, match=r"of another version of this package .*'newer'"):
+        made.is_done(tmp_path)
 
 
 def test_how_far_a_training_is_by_its_log(tmp_path: Path) -> None:
