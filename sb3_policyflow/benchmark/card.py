@@ -12,7 +12,7 @@ import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
 from sb3_policyflow.benchmark.measure.evaluation import evaluate, modes
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -118,7 +118,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", required=True, help="id of the environment")
     parser.add_argument("--out", type=Path, default=Path("card"), help="a folder; default: card")
     parser.add_argument("--vecnormalize", type=Path, help="what VecNormalize.save wrote")
-    parser.add_argument("--episodes", type=int, default=20, help="of each way to act; default: 20")
+    parser.add_argument(
+        "--episodes", type=at_least(1), default=20, help="of each way to act; default: 20"
+    )
 
 
 def main(arguments: argparse.Namespace) -> int:

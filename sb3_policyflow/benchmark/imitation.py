@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -240,7 +240,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algos", nargs="+", choices=MULTI_GOAL.algorithms, help="default: all")
     parser.add_argument(
         "--steps",
-        type=float,
+        type=at_least(1, float),
         help="environment steps of each; default: 1e6 (good), 5e6 (slow), 2e6 (pointmaze)",
     )
     add_running_arguments(parser, Path("docs/results/imitation"))

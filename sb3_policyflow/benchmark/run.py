@@ -14,7 +14,7 @@ from typing import Any
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
-from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.errors import at_least, require_env
 from sb3_policyflow.benchmark.results import DEFAULT_FOLDER, PROGRESS, Run
 from sb3_policyflow.integrations.rl_zoo3.experiment import check_hyperparams
 
@@ -141,7 +141,7 @@ def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     parser.add_argument(
         "--out", type=Path, default=out, help="folder of the results; default: %(default)s"
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="default: 0")
+    parser.add_argument("--seeds", type=at_least(0), nargs="+", default=[0], help="default: 0")
     numbers = {
         "jobs": (1, "processes at a time"),
         "threads": (1, "threads of each"),
@@ -150,7 +150,7 @@ def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(
-            f"--{name}", type=int, default=default, help=f"{text}; default: %(default)s"
+            f"--{name}", type=at_least(1), default=default, help=f"{text}; default: %(default)s"
         )
 
 
@@ -165,7 +165,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--algos", nargs="+", choices=algos, default=default, help=f"default: {default}"
     )
     parser.add_argument("--envs", nargs="+", required=True, help="ids of environments")
-    parser.add_argument("--steps", type=float, required=True, help="environment steps, say 1e6")
+    parser.add_argument(
+        "--steps", type=at_least(1, float), required=True, help="environment steps, say 1e6"
+    )
     parser.add_argument(
         "--hyperparams",
         nargs="+",

@@ -15,6 +15,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_policyflow.benchmark.errors import at_least
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.costs import GradientSteps, network_evaluations
 from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC, EvaluationCallback, evaluate
@@ -171,7 +172,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("run", type=json.loads, help="the fields of a Run, as JSON")
     parser.add_argument("folder", type=Path, help="where the results go")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
+    parser.add_argument("--threads", type=at_least(1), default=1, help="threads of torch")
     parser.add_argument("--agents", type=Path, help="where the trained agent goes")
 
 

@@ -151,10 +151,46 @@ def test_a_failing_run_is_reported_and_its_log_kept(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_figure_says_what_failed_though_there_is_nothing_to_draw(tmp_path: Path) -> None:
     settings = ["--steps", "10", "--variants", "a-ppo", "--out", str(tmp_path)]
-    # No evaluation after -1 episodes: the training fails.
-    outcome = benchmark("multigoal", *settings, "--episodes", "-1")
+    # Where the curve would go there is a folder: the training fails.
+    (tmp_path / "a-ppo" / "MultiGoal-v0" / "seed-0.csv").mkdir(parents=True)
+    outcome = benchmark("multigoal", *settings, "--evaluations", "1", "--episodes", "1")
     assert outcome.returncode == 2
     assert "failed: a-ppo MultiGoal-v0 seed 0\nNo results in" in outcome.stderr
+
+
+NUMBERS = {
+    "run": ("--steps", "--evaluations", "--episodes", "--jobs", "--threads", "--seeds"),
+    "multigoal": ("--steps", "--evaluations", "--seeds"),
+    "imitation": ("--steps", "--evaluations", "--seeds"),
+    "agent": ("--steps", "--episodes", "--seeds"),
+    "demo": ("--steps", "--seed"),
+    "card": ("--episodes",),
+    "speed": ("--repetitions", "--threads"),
+    "environments": ("--num-envs", "--seconds"),
+}
+REQUIRED = {"run": ["--envs", "Pendulum-v1", "--steps", "10"], "card": ["model", "--env", "a-v0"]}
+
+
+@pytest.mark.parametrize(
+    ("subcommand", "option"), [(name, option) for name in NUMBERS for option in NUMBERS[name]]
+)
+def test_numbers_that_make_no_sense_are_refused_before_a_training(
+    subcommand: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    number = "-1" if option in ("--seed", "--seeds") else "0"
+    with pytest.raises(SystemExit) as exit_of:
+        main([subcommand, *REQUIRED.get(subcommand, []), option, number])
+    assert exit_of.value.code == 2
+    said = capsys.readouterr().err
+    assert f"argument {option}: must be at least" in said
+    assert said.endswith(f", got {number}\n")
+
+
+@pytest.mark.parametrize("steps", ["inf", "nan", "1e400", "many"])
+def test_steps_without_an_end_are_refused(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--envs", "Pendulum-v1", "--steps", steps])
+    assert "argument --steps: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("subcommand", ["run", "playground"])
