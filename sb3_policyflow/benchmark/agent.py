@@ -54,10 +54,7 @@ def make_demonstrations(path: Path, steps: int = AGENT_STEPS, n: int = N_DEMONST
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as logs:
-        manager = make_experiment(ALGO, ENV, steps, AGENT_SEED, logs)
-        setup = manager.setup_experiment()
-        assert setup is not None
-        model: Any = setup[0]
+        model: Any = make_experiment(ALGO, ENV, steps, AGENT_SEED, logs).model
         model.learn(steps)
         episodes = record_episodes(model, n_episodes=n)
         said = {

@@ -13,16 +13,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
-from sb3_policyflow.benchmark.measure.evaluation import evaluate, modes
+from sb3_policyflow.benchmark.measure.evaluation import MODES, evaluate, modes
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.export import load_model
-
-MODES = {
-    "stochastic": "actions drawn as in training",
-    "latent-only": "latents drawn, no other noise",
-    "deterministic": "one action for each observation, no noise",
-}
 
 
 def write_card(

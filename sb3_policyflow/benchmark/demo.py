@@ -84,15 +84,11 @@ def train(seed: int, steps: int, folder: Path) -> tuple[OnPolicyAlgorithm, bool]
     :param folder: Where the log and the model go.
     :return: The model, and whether its training is complete.
     """
-    experiment = make_experiment("policyflow", ENV, steps, seed, str(folder))
-    setup = experiment.setup_experiment()
-    assert setup is not None
-    model = setup[0]
-    assert isinstance(model, OnPolicyAlgorithm)
+    manager, model, _ = make_experiment("policyflow", ENV, steps, seed, str(folder))
     model.set_logger(configure(str(folder), ["csv"]))
     progress, complete = GoalsCallback(EVALUATE_EVERY), True
     try:
-        model.learn(experiment.n_timesteps, progress)
+        model.learn(manager.n_timesteps, progress)
     except KeyboardInterrupt:
         complete = False
     finally:

@@ -48,11 +48,8 @@ def train_one(run: Run, folder: Path, agents: Path | None = None) -> Result:
     :param agents: Where the trained agent goes, see :func:`keep_agent`.
     """
     with tempfile.TemporaryDirectory() as logs:
-        manager = make_experiment(run.algo, run.env, run.steps, run.seed, logs, run.hyperparams)
-        setup = manager.setup_experiment()
-        assert setup is not None
-        model, hyperparams = setup
-        assert isinstance(model, OnPolicyAlgorithm)
+        settings = run.algo, run.env, run.steps, run.seed, logs, run.hyperparams
+        manager, model, hyperparams = make_experiment(*settings)
         env = manager.create_envs(min(N_EVALUATION_ENVS, run.n_episodes), eval_env=True)
         due = np.linspace(0, run.steps, run.n_evaluations + 1)[1:].round().astype(int).tolist()
         evaluations = EvaluationCallback(env, due, run.n_episodes)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 from gymnasium import spaces
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 pytest.importorskip("rl_zoo3")
 
@@ -18,11 +17,8 @@ def test_each_algorithm_takes_its_settings(name: str, tmp_path: Path) -> None:
     algo, hyperparams = VARIANTS[name].algo, VARIANTS[name].hyperparams
     # This environment's learning rate follows the divergence, which allows no schedule.
     pendulum = {"desired_kl": None} if algo == "policyflow" else {}
-    manager = make_experiment(algo, "Pendulum-v1", 16384, 0, str(tmp_path), hyperparams | pendulum)
-    setup = manager.setup_experiment()
-    assert setup is not None
-    model = setup[0]
-    assert isinstance(model, OnPolicyAlgorithm)
+    settings = algo, "Pendulum-v1", 16384, 0, str(tmp_path), hyperparams | pendulum
+    model = make_experiment(*settings).model
     assert isinstance(model.action_space, spaces.Box)
     assert model.n_envs * model.n_steps == 16384
     assert model.policy.net_arch == {"pi": [32] * 4, "vf": [128] * 3}
