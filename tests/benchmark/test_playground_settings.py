@@ -10,6 +10,9 @@ pytest.importorskip("rl_zoo3")
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.playground import ROLLOUTS, VARIANTS
 
+LATENT_STDS = {"policyflow": 1.0, "policyflow-latent0.3": 0.3}
+"""The paper's, and narrower ones."""
+
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_each_algorithm_takes_its_settings(name: str, tmp_path: Path) -> None:
@@ -24,5 +27,7 @@ def test_each_algorithm_takes_its_settings(name: str, tmp_path: Path) -> None:
     assert model.policy.net_arch == {"pi": [32] * 4, "vf": [128] * 3}
     assert model.lr_schedule(0.5) == pytest.approx(float(hyperparams["learning_rate"][4:]) / 2)
     assert {key: getattr(model, key) for key in ROLLOUTS} == ROLLOUTS
+    if name in LATENT_STDS:
+        assert model.policy.latent_std == LATENT_STDS[name]
     for key in hyperparams.keys() & {"min_sampling_std", "min_log_prob_std"}:
         assert getattr(model.policy, key) == hyperparams[key]
