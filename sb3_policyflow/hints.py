@@ -1,7 +1,7 @@
 """What error messages advise: the nearest names, and the command that installs an extra."""
 
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from difflib import get_close_matches
 from importlib import metadata
 from pathlib import Path
@@ -43,6 +43,21 @@ def did_you_mean(name: str, known: Collection[str], otherwise: str = "") -> str:
     if similar:
         return f"did you mean {either(similar)}?"
     return otherwise or f"there are {', '.join(sorted(known))}."
+
+
+def refuse_both_names(given: Mapping[str, Any], former_names: Mapping[str, str]) -> None:
+    """Refuse an argument that is given under its former name and under its present one.
+
+    :param given: Arguments by name.
+    :param former_names: Present names by former ones; "DICTIONARY.KEY" for an argument that has
+        become a key of another one.
+    :raises ValueError: With the name to leave out.
+    """
+    for former in sorted(former_names.keys() & given.keys()):
+        name, _, key = former_names[former].partition(".")
+        if key in (given.get(name) or ()) if key else name in given:
+            present = f"{name} with the key {key}" if key else name
+            raise ValueError(f"{former} is now {present}, and both are given: leave out {former}.")
 
 
 def install_command(extra: str, upgrade: bool = False) -> str:

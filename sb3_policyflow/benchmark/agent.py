@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC
 from sb3_policyflow.benchmark.report.markdown import markdown_table
@@ -54,10 +54,7 @@ def make_demonstrations(path: Path, steps: int = AGENT_STEPS, n: int = N_DEMONST
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as logs:
-        manager = make_experiment(ALGO, ENV, steps, AGENT_SEED, logs)
-        setup = manager.setup_experiment()
-        assert setup is not None
-        model: Any = setup[0]
+        model: Any = make_experiment(ALGO, ENV, steps, AGENT_SEED, logs).model
         model.learn(steps)
         episodes = record_episodes(model, n_episodes=n)
         said = {
@@ -145,7 +142,10 @@ def agent_table(results: Sequence[Result], wanted: float) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument(
-        "--steps", type=float, default=3e5, help="environment steps of each; default: 3e5"
+        "--steps",
+        type=at_least(1, float),
+        default=3e5,
+        help="environment steps of each; default: 3e5",
     )
     add_running_arguments(parser, Path("docs/results/agent"))
     parser.set_defaults(episodes=5, evaluations=30)
@@ -157,8 +157,9 @@ def main(arguments: argparse.Namespace) -> int:
     th.set_num_threads(arguments.threads)
     path = demonstrations(arguments.out)
     make_demonstrations(path)
+    wanted = wanted_return(path)
     code = run_and_report(runs(arguments), arguments)
-    table = agent_table(load_results(arguments.out), wanted_return(path))
+    table = agent_table(load_results(arguments.out), wanted)
     (arguments.out / "agent.md").write_text(table, encoding="utf-8")
     print(f"Wrote {arguments.out / 'agent.md'}.")
     return code

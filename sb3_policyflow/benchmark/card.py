@@ -12,20 +12,14 @@ import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
-from sb3_policyflow.benchmark.measure.evaluation import evaluate, modes
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
+from sb3_policyflow.benchmark.measure.evaluation import MODES, evaluate, modes
 from sb3_policyflow.benchmark.measure.provenance import versions
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.export import load_model
 from sb3_policyflow.resilience.files import saved_model
 from sb3_policyflow.resilience.normalization import check_normalization, read_statistics
-
-MODES = {
-    "stochastic": "actions drawn as in training",
-    "latent-only": "latents drawn, no other noise",
-    "deterministic": "one action for each observation, no noise",
-}
 
 
 def write_card(
@@ -138,7 +132,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", required=True, help="id of the environment")
     parser.add_argument("--out", type=Path, default=Path("card"), help="a folder; default: card")
     parser.add_argument("--vecnormalize", type=Path, help="what VecNormalize.save wrote")
-    parser.add_argument("--episodes", type=int, default=20, help="of each way to act; default: 20")
+    parser.add_argument(
+        "--episodes", type=at_least(1), default=20, help="of each way to act; default: 20"
+    )
 
 
 def main(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
-from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.figures.progress import progress_figure
@@ -84,15 +84,11 @@ def train(seed: int, steps: int, folder: Path) -> tuple[OnPolicyAlgorithm, bool]
     :param folder: Where the log and the model go.
     :return: The model, and whether its training is complete.
     """
-    experiment = make_experiment("policyflow", ENV, steps, seed, str(folder))
-    setup = experiment.setup_experiment()
-    assert setup is not None
-    model = setup[0]
-    assert isinstance(model, OnPolicyAlgorithm)
+    manager, model, _ = make_experiment("policyflow", ENV, steps, seed, str(folder))
     model.set_logger(configure(str(folder), ["csv"]))
     progress, complete = GoalsCallback(EVALUATE_EVERY), True
     try:
-        model.learn(experiment.n_timesteps, progress)
+        model.learn(manager.n_timesteps, progress)
     except KeyboardInterrupt:
         complete = False
     finally:
@@ -103,9 +99,12 @@ def train(seed: int, steps: int, folder: Path) -> tuple[OnPolicyAlgorithm, bool]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="default: 0")
     parser.add_argument(
-        "--steps", type=float, default=STEPS, help="environment steps; default: 10 million"
+        "--steps",
+        type=at_least(1, float),
+        default=STEPS,
+        help="environment steps; default: 10 million",
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), help="a folder; default: demo")
 

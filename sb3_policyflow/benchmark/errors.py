@@ -1,5 +1,9 @@
 """What a command cannot do, said before it starts."""
 
+import argparse
+import math
+from collections.abc import Callable
+
 import gymnasium as gym
 
 from sb3_policyflow.envs import PLAYGROUND, ensure_registered
@@ -10,6 +14,25 @@ from sb3_policyflow.envs.point_maze import medium_maze
 
 class BenchmarkError(ValueError):
     """A command cannot do what it was asked for; the message says what to do."""
+
+
+def at_least(least: float, kind: type[int] | type[float] = int) -> Callable[[str], float]:
+    """A type for ``argparse``: finite numbers that are not less than a least one.
+
+    >>> at_least(1)("3"), at_least(1, float)("1e6")
+    (3, 1000000.0)
+
+    :param least: The least number.
+    :param kind: The type of the numbers.
+    """
+
+    def number(text: str) -> float:
+        value = kind(text)
+        if not least <= value < math.inf:
+            raise argparse.ArgumentTypeError(f"must be at least {least}, got {text}")
+        return value
+
+    return number
 
 
 def require_env(env_id: str) -> None:

@@ -2,9 +2,18 @@
 
 import argparse
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+
+class Experiment(NamedTuple):
+    """What is ready to train: ``hyperparams`` are those that rl_zoo3 has made the model with."""
+
+    manager: ExperimentManager
+    model: OnPolicyAlgorithm
+    hyperparams: dict[str, Any]
 
 
 def make_experiment(
@@ -14,8 +23,8 @@ def make_experiment(
     seed: int,
     logs: str,
     hyperparams: Mapping[str, Any] | None = None,
-) -> ExperimentManager:
-    """An experiment with the hyperparameters of the YAML files.
+) -> Experiment:
+    """Set up an experiment with the hyperparameters of the YAML files.
 
     :param algo: rl_zoo3's name of the algorithm.
     :param env: Id of the environment.
@@ -24,7 +33,7 @@ def make_experiment(
     :param logs: Folder in which rl_zoo3 keeps its files.
     :param hyperparams: What differs from the YAML file.
     """
-    return ExperimentManager(
+    manager = ExperimentManager(
         argparse.Namespace(env_kwargs=None),  # what rl_zoo3's enjoy reads of a command line
         algo,
         env,
@@ -36,3 +45,8 @@ def make_experiment(
         verbose=0,
         device="cpu",
     )
+    setup = manager.setup_experiment()
+    assert setup is not None  # it is where it optimizes hyperparameters
+    model, chosen = setup
+    assert isinstance(model, OnPolicyAlgorithm)
+    return Experiment(manager, model, chosen)

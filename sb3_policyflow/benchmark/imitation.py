@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sb3_policyflow.benchmark.errors import BenchmarkError, require_env
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
 from sb3_policyflow.benchmark.figures.goals import goals_figure
+from sb3_policyflow.benchmark.measure.goals import GoalReport
 from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
@@ -199,14 +200,13 @@ def _quantities(result: Result, is_trained: bool) -> dict[str, float]:
     """What the table says of a run, before or after its training."""
     summary = result.summary
     evaluation = summary["final"]["stochastic"] if is_trained else summary["cloned"]
-    goals = summary["goals"] if is_trained else summary["cloned"]["goals"]
-    n_missed = goals["n_missed"]
+    goals = GoalReport.from_summary((summary if is_trained else summary["cloned"])["goals"])
     values = (
         evaluation["mean_return"],
-        goals["mean_return"],
-        goals["n_goals"],
-        goals["entropy"],
-        100 * n_missed / (n_missed + sum(goals["counts"])),
+        goals.mean_return,
+        goals.n_goals,
+        goals.entropy,
+        100 * goals.share_missed,
     )
     return dict(zip(QUANTITIES, map(float, values), strict=True))
 
@@ -240,7 +240,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algos", nargs="+", choices=MULTI_GOAL.algorithms, help="default: all")
     parser.add_argument(
         "--steps",
-        type=float,
+        type=at_least(1, float),
         help="environment steps of each; default: 1e6 (good), 5e6 (slow), 2e6 (pointmaze)",
     )
     add_running_arguments(parser, Path("docs/results/imitation"))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_policyflow.benchmark.figures.goals import goals_figure
-from sb3_policyflow.benchmark.measure.goals import Trajectories
+from sb3_policyflow.benchmark.measure.goals import GoalReport, Trajectories
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
 from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
@@ -92,16 +92,15 @@ def goals_table(results: Sequence[Result]) -> str:
 
 def _row(name: str, results: Sequence[Result]) -> list[str]:
     summaries = [result.summary for result in results]
-    goals = [summary["goals"] for summary in summaries]
-    missed = [g["n_missed"] / (g["n_missed"] + sum(g["counts"])) for g in goals]
+    goals = [GoalReport.from_summary(summary["goals"]) for summary in summaries]
     return [
         VARIANTS[name].title if name in VARIANTS else name,
         str(len(results)),
-        over_seeds([g["mean_return"] for g in goals]).format(".2f"),
+        over_seeds([g.mean_return for g in goals]).format(".2f"),
         over_seeds([s["final"]["stochastic"]["mean_return"] for s in summaries]).format(".2f"),
-        over_seeds([g["n_goals"] for g in goals]).format(".2g"),
-        over_seeds([g["entropy"] for g in goals]).format(".2f"),
-        f"{np.mean(missed):.1%}",
+        over_seeds([g.n_goals for g in goals]).format(".2g"),
+        over_seeds([g.entropy for g in goals]).format(".2f"),
+        f"{np.mean([g.share_missed for g in goals]):.1%}",
         f"{np.mean([summary['gradient_steps'] for summary in summaries]):,.0f}",
         f"{np.mean([summary['seconds']['training'] for summary in summaries]) / 60:.1f}",
     ]

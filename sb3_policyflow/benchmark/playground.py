@@ -30,7 +30,7 @@ TIME = "embedding_dim=8,frequencies=[0.15915494,0.31830989,0.63661977,1.27323954
 
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "policyflow": {
-        "policy_kwargs": f"dict({NETWORKS})",
+        "policy_kwargs": f"dict({NETWORKS},latent_std=1.0)",
         "learning_rate": "lin_0.003",
         "clip_range": 0.2,
     },
@@ -55,7 +55,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 }
 """What differs from the YAML files beside the rollouts: the learning rate, PolicyFlow's clip range
 and DPPO's noise, chosen on CheetahRun, and FPO's clamp, without which a training became infinite
-(docs/results.md). The second PolicyFlow has narrower latents than the paper's."""
+(docs/results.md). The second PolicyFlow has narrower latents than the paper's, which the first has
+to name: these ``policy_kwargs`` replace those of the YAML file."""
 
 VARIANTS = {
     name: Variant(name, name.partition("-")[0], ROLLOUTS | hyperparams)

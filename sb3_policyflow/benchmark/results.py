@@ -57,18 +57,29 @@ class Run:
         """Where a file of it is, for instance with the suffix ".json"."""
         return folder / self.name / self.env.replace("/", "-") / f"seed-{self.seed}{suffix}"
 
+    def as_json(self) -> str:
+        """Its fields, as its results and the process that trains it get them.
+
+        :raises BenchmarkError: If a hyperparameter has no JSON.
+        """
+        for name, value in self.hyperparams.items():
+            _require_json(name, value)
+        return json.dumps(asdict(self))
+
     def is_done(self, folder: Path) -> bool:
         """Whether its results are there.
 
-        :raises BenchmarkError: If they are, and were made with other settings.
+        :raises BenchmarkError: If they are, and were made with other settings; or if this run could
+            not be written.
         """
-        path = self.path(folder, ".json")
+        # In JSON a tuple is a list.
+        written, path = Run(**json.loads(self.as_json())), self.path(folder, ".json")
         if not path.is_file():
             return False
-        settings, _ = _read_summary(path)
-        if settings != asdict(self):
+        run, _ = _read_summary(path)
+        if run != written:
             raise BenchmarkError(
-                f"{path} was made with other settings, {settings}: choose another --out, or "
+                f"{path} was made with other settings, {asdict(run)}: choose another --out, or "
                 "delete it."
             )
         return True
@@ -100,13 +111,13 @@ class Result:
 
         :param path: The JSON file.
         """
-        settings, summary = _read_summary(path)
+        run, summary = _read_summary(path)
         with open(path.with_suffix(".csv"), newline="", encoding="utf-8") as file:
             curve: list[dict[str, Any]] = [
                 {key: value if key == "mode" else float(value) for key, value in row.items()}
                 for row in csv.DictReader(file)
             ]
-        return cls(Run(**settings), summary, curve)
+        return cls(run, summary, curve)
 
     def final_return(self, mode: str) -> float | None:
         """Mean return at the end of the training; None if there is no such mode."""
@@ -119,12 +130,36 @@ class Result:
         return [row["timesteps"] for row in rows], [row["mean_return"] for row in rows]
 
 
-def _read_summary(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The settings of a run, and the rest of its JSON file."""
+def _require_json(name: str, value: object) -> None:
+    """Refuse a hyperparameter that no JSON file can hold.
+
+    :raises BenchmarkError: With how to write it.
+    """
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError) as error:
+        raise BenchmarkError(
+            f"{name}:{value!r} cannot be written to a JSON file ({error}). Write a dictionary with "
+            "such values as a quoted string, \"policy_kwargs:'dict(...)'\", as rl_zoo3's YAML "
+            "files do."
+        ) from error
+
+
+def _read_summary(path: Path) -> tuple[Run, dict[str, Any]]:
+    """A run, whose newest fields an earlier version may not have written, and the rest of its file.
+
+    :raises BenchmarkError: If it has fields that this version does not know.
+    """
     summary = json.loads(path.read_text(encoding="utf-8"))
     # Version 0.1.0 wrote "cell".
     settings = summary.pop("run" if "run" in summary else "cell")
-    return settings, summary
+    try:
+        return Run(**settings), summary
+    except TypeError as error:
+        raise BenchmarkError(
+            f"{path} is of another version of this package ({error}): choose another folder, or "
+            "delete it."
+        ) from error
 
 
 def load_results(folder: Path, envs: Sequence[str] = ()) -> list[Result]:

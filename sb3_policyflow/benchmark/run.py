@@ -1,7 +1,6 @@
 """Train algorithms in environments with several seeds; what has been run is not run again."""
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -9,14 +8,13 @@ import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tqdm import tqdm
 
-from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.errors import at_least, require_env
 from sb3_policyflow.benchmark.results import DEFAULT_FOLDER, PROGRESS, Run
 from sb3_policyflow.integrations.rl_zoo3.experiment import check_hyperparams
 
@@ -41,7 +39,7 @@ def run_all(
     :param n_threads: Threads of each.
     :param agents: Where trained agents go; None to keep none.
     :return: The runs that failed.
-    :raises BenchmarkError: If one has been run with other settings.
+    :raises BenchmarkError: If one has been run with other settings, or could not be written.
     """
     runs = list(runs)
     missing = [run for run in runs if not run.is_done(folder)]
@@ -104,7 +102,7 @@ def _succeeds(run: Run, folder: Path, n_threads: int, agents: Path | None) -> bo
     log = run.path(folder, ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "sb3_policyflow.benchmark", "train-one"]
-    command += [json.dumps(asdict(run)), str(folder), "--threads", str(n_threads)]
+    command += [run.as_json(), str(folder), "--threads", str(n_threads)]
     command += [] if agents is None else ["--agents", str(agents)]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(n_threads))
     with open(log, "w", encoding="utf-8") as file:
@@ -143,7 +141,7 @@ def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     parser.add_argument(
         "--out", type=Path, default=out, help="folder of the results; default: %(default)s"
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="default: 0")
+    parser.add_argument("--seeds", type=at_least(0), nargs="+", default=[0], help="default: 0")
     numbers = {
         "jobs": (1, "processes at a time"),
         "threads": (1, "threads of each"),
@@ -152,7 +150,7 @@ def add_running_arguments(parser: argparse.ArgumentParser, out: Path) -> None:
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(
-            f"--{name}", type=int, default=default, help=f"{text}; default: %(default)s"
+            f"--{name}", type=at_least(1), default=default, help=f"{text}; default: %(default)s"
         )
 
 
@@ -167,7 +165,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--algos", nargs="+", choices=algos, default=default, help=f"default: {default}"
     )
     parser.add_argument("--envs", nargs="+", required=True, help="ids of environments")
-    parser.add_argument("--steps", type=float, required=True, help="environment steps, say 1e6")
+    parser.add_argument(
+        "--steps", type=at_least(1, float), required=True, help="environment steps, say 1e6"
+    )
     parser.add_argument(
         "--hyperparams",
         nargs="+",

@@ -15,6 +15,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_policyflow.benchmark.errors import at_least
 from sb3_policyflow.benchmark.experiment import make_experiment
 from sb3_policyflow.benchmark.measure.costs import GradientSteps, network_evaluations
 from sb3_policyflow.benchmark.measure.evaluation import STOCHASTIC, EvaluationCallback, evaluate
@@ -47,11 +48,8 @@ def train_one(run: Run, folder: Path, agents: Path | None = None) -> Result:
     :param agents: Where the trained agent goes, see :func:`keep_agent`.
     """
     with tempfile.TemporaryDirectory() as logs:
-        manager = make_experiment(run.algo, run.env, run.steps, run.seed, logs, run.hyperparams)
-        setup = manager.setup_experiment()
-        assert setup is not None
-        model, hyperparams = setup
-        assert isinstance(model, OnPolicyAlgorithm)
+        settings = run.algo, run.env, run.steps, run.seed, logs, run.hyperparams
+        manager, model, hyperparams = make_experiment(*settings)
         env = manager.create_envs(min(N_EVALUATION_ENVS, run.n_episodes), eval_env=True)
         due = np.linspace(0, run.steps, run.n_evaluations + 1)[1:].round().astype(int).tolist()
         evaluations = EvaluationCallback(env, due, run.n_episodes)
@@ -171,7 +169,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("run", type=json.loads, help="the fields of a Run, as JSON")
     parser.add_argument("folder", type=Path, help="where the results go")
-    parser.add_argument("--threads", type=int, default=1, help="threads of torch")
+    parser.add_argument("--threads", type=at_least(1), default=1, help="threads of torch")
     parser.add_argument("--agents", type=Path, help="where the trained agent goes")
 
 

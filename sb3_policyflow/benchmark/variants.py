@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sb3_policyflow.benchmark.errors import at_least
 from sb3_policyflow.benchmark.results import Run
 from sb3_policyflow.benchmark.run import add_running_arguments
 
@@ -55,7 +56,10 @@ def add_variant_arguments(
     :param out: Folder of the results, if not given.
     """
     parser.add_argument(
-        "--steps", type=float, default=steps, help=f"environment steps of each; default: {steps:g}"
+        "--steps",
+        type=at_least(1, float),
+        default=steps,
+        help=f"environment steps of each; default: {steps:g}",
     )
     parser.add_argument(
         "--variants", nargs="+", choices=variants, default=list(variants), help="default: all"

@@ -10,7 +10,8 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_policyflow.hints import did_you_mean, either, nearest
+from sb3_policyflow.hints import did_you_mean, either, nearest, refuse_both_names
+from sb3_policyflow.resilience.saving import SUPERSEDED
 
 FORMER_VALUES: dict[tuple[str, object], str] = {
     ("time_sampler", "starts"): "grid_without_end",
@@ -233,6 +234,33 @@ def check_names(
         )
 
 
+def check_given_once(
+    owner: str, options: Collection[str], policy_kwargs: Mapping[str, Any], policy_class: type[Any]
+) -> None:
+    """Refuse an option of a policy that is given twice, under whichever of its names.
+
+    :param owner: The algorithm, for error messages.
+    :param options: Present names of the policy's options that were given to the algorithm.
+    :param policy_kwargs: What was given for its policy.
+    :param policy_class: The class of its policy.
+    :raises ValueError: With what was given twice.
+    """
+    former_names = policy_former_names(policy_class)
+    refuse_both_names(policy_kwargs, former_names)
+    present = with_present_names(policy_kwargs, former_names, warn=False)
+    twice = sorted(set(options) & present.keys())
+    if twice:
+        raise ValueError(f"Give {twice} to {owner} or in policy_kwargs, not to both.")
+
+
+def policy_former_names(policy_class: type[Any]) -> dict[str, str]:
+    """Present names by former ones of what the constructors of a policy and its bases take."""
+    found: dict[str, str] = {}
+    for cls in reversed(policy_class.__mro__):
+        found |= getattr(vars(cls).get("__init__"), "former_names", {})
+    return {name: found[name] for name in found.keys() - policy_parameters(policy_class)}
+
+
 def check_saved_by(model: Any) -> None:
     """Refuse a file that another algorithm has saved.
 
@@ -264,7 +292,8 @@ def with_present_names(
     >>> with_present_names({"size": 2, "factor": 3}, {"factor": "rule_kwargs.factor"}, warn=False)
     {'size': 2, 'rule_kwargs': {'factor': 3}}
 
-    :param options: Options by name, former or present.
+    :param options: Options by name, former or present. Where a file's are mixed with those given to
+        ``load``, what has a former name counts; users are refused both names before.
     :param former_names: Present names by former ones; "DICTIONARY.KEY" for an option that has
         become a key of another one.
     :param warn: Whether to warn. Options that come from a file are nobody's mistake.
@@ -272,6 +301,8 @@ def with_present_names(
     present = {name: value for name, value in options.items() if name not in former_names}
     for former in former_names.keys() & options.keys():
         name, _, key = former_names[former].partition(".")
+        if options[former] is SUPERSEDED:
+            continue
         present[name] = (
             {**(present.get(name) or {}), key: options[former]} if key else options[former]
         )

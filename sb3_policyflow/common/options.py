@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.names import (
     FOREIGN_ARGUMENTS,
+    check_given_once,
     check_names,
     check_saved_by,
     named_parameters,
@@ -30,6 +31,7 @@ from sb3_policyflow.common.schedules import (
     positive_at_first,
 )
 from sb3_policyflow.common.update import check_cloned, check_model
+from sb3_policyflow.hints import refuse_both_names
 
 P = ParamSpec("P")
 
@@ -135,13 +137,13 @@ def shares_options(
 
         @functools.wraps(init)
         def completed(*args: Any, **options: Any) -> None:
+            refuse_both_names(options, former_names)
             options = with_present_names(options, former_names)
             check_names(signature, policy_class, args, options)
             given = signature.bind(*args, **options).arguments
-            twice = sorted(names & given.keys() & (given.get("policy_kwargs") or {}).keys())
-            if twice:
-                name = type(given["self"]).__name__
-                raise ValueError(f"Give {twice} to {name} or in policy_kwargs, not to both.")
+            owner, policy = type(given["self"]).__name__, given["policy"]
+            chosen = policy if isinstance(policy, type) else policy_class
+            check_given_once(owner, names & given.keys(), given.get("policy_kwargs") or {}, chosen)
             cast("Callable[..., None]", init)(**{**defaults, **given})
 
         vars(completed)["__signature__"] = signature  # where inspect looks for it
@@ -214,6 +216,7 @@ def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], C
                 raise unknown_argument(owner.__name__, name, policy_parameters(owner))
             cast("Callable[..., None]", init)(*args, **present)
 
+        vars(extended)["former_names"] = former_names
         return extended
 
     return extend

@@ -17,13 +17,15 @@ class PolicyTerms(NamedTuple):
 
     ``log_ratio`` has shape (n, ...), with one entry for each surrogate; ``kl`` has no dimensions
     and measures the change of the policy in nats; ``regularizer`` is added to the loss; the means
-    of ``metrics`` over the minibatches are logged under ``train/``.
+    of ``metrics`` over the minibatches are logged under ``train/``. ``unclamped`` is the log ratio
+    before the algorithm has clamped it; None if it has not.
     """
 
     log_ratio: th.Tensor
     kl: th.Tensor
     regularizer: th.Tensor
     metrics: dict[str, th.Tensor]
+    unclamped: th.Tensor | None = None
 
 
 class Loss(Protocol):
@@ -158,6 +160,8 @@ class FlowUpdate(ABC):
                 regularizer=terms.regularizer + self.pull.coef * pull,
                 metrics={**terms.metrics, "imitation_loss": pull},
             )
+        unclamped = terms.log_ratio if terms.unclamped is None else terms.unclamped
+        metrics.add_maxima({"log_ratio_max": unclamped.detach().abs().max()})
         policy_loss = self.surrogate_loss(terms.log_ratio, batch.advantages, metrics)  # line 19
         # Squared error of the values against the TD(lambda) returns
         values = self.policy.values(critic_features).flatten()
@@ -175,7 +179,6 @@ class FlowUpdate(ABC):
         :param metrics: Takes the loss and what is to be logged of the ratios.
         :return: The mean over samples and surrogates, a tensor without dimensions.
         """
-        metrics.add_maxima({"log_ratio_max": log_ratio.detach().abs().max()})
         if self.log_ratio_clamp is not None:
             log_ratio = log_ratio.clamp(-self.log_ratio_clamp, self.log_ratio_clamp)
         advantages = advantages.reshape(-1, *[1] * (log_ratio.dim() - 1))

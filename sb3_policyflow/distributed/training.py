@@ -2,7 +2,8 @@
 
 import inspect
 import io
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -102,8 +103,12 @@ class SharedTraining(Training):
                 s.mean.shape for s in running_statistics(model.get_vec_normalize_env())
             ],
         }
-        plain = {name: getattr(model, name) for name in sorted(names)}
-        mine |= {k: v for k, v in plain.items() if isinstance(v, (int, float, str, type(None)))}
+        given = {name: getattr(model, name) for name in sorted(names)}
+        mine |= {
+            name: _ends(v) if callable(v) and not isinstance(v, type) else comparable(v)
+            for name, v in given.items()
+        }
+        mine |= {name: comparable(value) for name, value in model.known_policy_options.items()}
         for rank, other in enumerate(group.gather(mine)):
             for name in mine:
                 if other.get(name) != mine[name]:
@@ -184,6 +189,35 @@ class SharedTraining(Training):
         if stopped:
             model.num_timesteps = min(stopped)
         return not stopped
+
+
+def comparable(value: Any) -> Any:
+    """The value of an option as ranks can compare it, which are processes of their own.
+
+    >>> comparable({"net_arch": (8, 8), "activation_fn": lambda inputs: inputs})
+    {'net_arch': [8, 8], 'activation_fn': '<function <lambda>>'}
+
+    :param value: The value; of what is neither a number nor a collection, the ``repr`` without
+        addresses in memory counts.
+    """
+    if isinstance(value, (int, float, str, type(None))):
+        return value
+    if isinstance(value, Mapping):
+        return {name: comparable(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [comparable(each) for each in value]
+    if isinstance(value, (set, frozenset)):  # whose order is a process's own
+        return sorted(map(str, map(comparable, value)))
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))
+
+
+def _ends(function: Callable[..., Any]) -> Any:
+    """A schedule by its values at the start and at the end, another function by its name."""
+    try:
+        start, end = float(function(1.0)), float(function(0.0))
+    except Exception:  # it belongs to an algorithm of the user's own, and may do anything
+        return comparable(function)
+    return start if start == end else f"{start} at first and {end} at the end"
 
 
 def _n_bytes(observations: Any) -> int:

@@ -96,15 +96,16 @@ class FPOUpdate(FlowUpdate):
         """Ratio from the change of the flow-matching loss (FPO, equation of the ratio)."""
         losses = self.losses(batch, features)
         log_ratio = batch.drawn.reference_losses - losses
-        clamp = self.algorithm.difference_clamp
+        unclamped, clamp = log_ratio.detach(), self.algorithm.difference_clamp
         if clamp is not None:
             log_ratio = log_ratio.clamp(-clamp, clamp)
         if self.algorithm.mc_average == "loss":
-            log_ratio = log_ratio.mean(dim=1)
+            log_ratio, unclamped = log_ratio.mean(dim=1), unclamped.mean(dim=1)
         # Entropy of the actions, from samples
         regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
         metrics["flow_matching_loss"] = losses.mean()
-        return PolicyTerms(log_ratio, ratio_divergence(log_ratio), regularizer, metrics)
+        kl = ratio_divergence(log_ratio)
+        return PolicyTerms(log_ratio, kl, regularizer, metrics, unclamped)
 
 
 class FPO(FlowOnPolicyAlgorithm):
@@ -133,6 +134,7 @@ class FPO(FlowOnPolicyAlgorithm):
         clips for positive advantages and penalizes for negative ones.
     :param loss_clamp: Greatest loss of a sample; None for no bound.
     :param difference_clamp: Greatest change of a sample's loss; None for no bound.
+        ``train/log_ratio_max`` is the greatest log ratio before the clamp.
     :param n_entropy_actions: Actions drawn in a state for the entropy that ``ent_coef`` weighs.
     :param n_entropy_states: States of a minibatch in which they are drawn, at most.
     :raises ValueError: If an argument cannot be used.

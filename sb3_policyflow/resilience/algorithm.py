@@ -33,6 +33,7 @@ from sb3_policyflow.resilience.saving import (
     ResumeState,
     check_attributes,
     continue_episodes,
+    superseded_attributes,
     takes_former_path,
 )
 from sb3_policyflow.resilience.training import Training, TrainingAlone
@@ -270,7 +271,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
         :param reseed: Whether to leave the random generators as the model's seed, if it has one,
             sets them, as SB3 does. So does a ``seed`` among ``kwargs``.
         :param kwargs: Attributes to change.
-        :raises ValueError: If the file is no saved model, or the environment does not fit it.
+        :raises ValueError: If the file is no saved model, the environment does not fit it, or an
+            attribute is given under two names.
         :raises TypeError: If there is no attribute of a name among ``kwargs``.
         """
         with opened(path, suffix="zip") as file:
@@ -278,6 +280,8 @@ class ResilientOnPolicyAlgorithm(OnPolicyAlgorithm):
             saved = saved_attributes(file)
             check_attributes(cls, kwargs, saved)
             missing = {k: v for k, v in cls.former_values.items() if k not in saved}
+            superseded = superseded_attributes(cls, kwargs, saved)
+            custom_objects = {**(custom_objects or {}), **superseded}
             kwargs = {**missing, **kwargs}
             model = super().load(
                 file, env, device, custom_objects, print_system_info, force_reset, **kwargs

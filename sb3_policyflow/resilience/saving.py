@@ -11,10 +11,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_policyflow.hints import did_you_mean
+from sb3_policyflow.hints import did_you_mean, refuse_both_names
 
 P = ParamSpec("P")
 T = TypeVar("T")
+SUPERSEDED = object()
+"""What a file's attribute has under its former name, where ``load`` changes the present one."""
 
 
 class RandomStates(NamedTuple):
@@ -136,6 +138,26 @@ def check_attributes(algorithm: type[Any], given: Collection[str], saved: Collec
             raise TypeError(f"{algorithm.__name__}.load has no {name!r} to change: {meant}")
 
 
+def superseded_attributes(
+    algorithm: type[Any], given: Mapping[str, Any], saved: Collection[str]
+) -> dict[str, Any]:
+    """What a file has under a former name, and ``load`` gets under the present one.
+
+    :param algorithm: The class of the model.
+    :param given: Attributes for ``load`` to change.
+    :param saved: Names of the attributes that are in the file.
+    :return: Former names, with :data:`SUPERSEDED` as their value.
+    :raises ValueError: If an attribute is given under both names.
+    """
+    former_names: Mapping[str, str] = algorithm.former_names
+    refuse_both_names(given, former_names)
+    return {
+        former: SUPERSEDED
+        for former, present in former_names.items()
+        if former in saved and former not in given and present.partition(".")[0] in given
+    }
+
+
 def takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
     """Let ``load`` change an attribute that was called ``path``, as its first parameter is."""
 
@@ -145,6 +167,7 @@ def takes_former_path(load: Callable[P, T]) -> Callable[P, T]:
         is_positional = len(args) > 1 and "path" in kwargs
         present = cls.former_names.get("path") if is_positional else None
         if present is not None:
+            refuse_both_names(kwargs, {"path": present})
             kwargs[present] = kwargs.pop("path")
         return load(*args, **kwargs)
 

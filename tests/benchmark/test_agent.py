@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_policyflow.benchmark import agent
+from sb3_policyflow.benchmark.__main__ import main
 from sb3_policyflow.benchmark.errors import BenchmarkError
 from sb3_policyflow.benchmark.results import Result, Run, load_results
 from sb3_policyflow.benchmark.train_one import train_one
@@ -50,6 +51,18 @@ def test_twice_a_negative_return_is_no_goal(tmp_path: Path) -> None:
     (tmp_path / "agent.json").write_text('{"mean_return": -3.0}')
     with pytest.raises(BenchmarkError, match="mean return of -3, twice which is no more"):
         agent.wanted_return(agent.demonstrations(tmp_path))
+
+
+def test_a_goal_that_is_none_is_refused_before_the_trainings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = agent.demonstrations(tmp_path)
+    path.parent.mkdir()
+    path.touch()
+    (tmp_path / "agent.json").write_text('{"mean_return": 0.0}')
+    assert main(["agent", "--out", str(tmp_path), "--steps", "1"]) == 2
+    assert "mean return of 0, twice which is no more" in capsys.readouterr().err
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["agent.json", "demonstrations"]
 
 
 @pytest.mark.slow

@@ -50,6 +50,17 @@ def test_playground(task: str) -> None:
     assert n_done("playground", playground.VARIANTS, 5, 3_000_000, env=env) == 15
 
 
+def test_playground_without_the_brownian_term() -> None:
+    """The command that docs/results.md has for it."""
+    variant = playground.VARIANTS["policyflow"]
+    hyperparams = variant.hyperparams | {"brownian_coef": 0.0}
+    text = (RESULTS.parent / "results.md").read_text(encoding="utf-8")
+    assert f"\"policy_kwargs:'{hyperparams['policy_kwargs']}'\"" in text
+    variants = {"policyflow": variant._replace(hyperparams=hyperparams)}
+    env = "Playground/WalkerWalk-v0"
+    assert n_done("playground-no-brownian", variants, 5, 3_000_000, env=env) == 3
+
+
 @pytest.mark.parametrize("task", ["ReacherEasy", "FingerTurnEasy", "BallInCup", "WalkerWalk"])
 def test_playground_held_out(task: str) -> None:
     names = ("policyflow", "policyflow-latent0.3", "ppo")

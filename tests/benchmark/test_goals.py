@@ -1,5 +1,7 @@
 """Counting goals: hand-built trajectories, sampled ones, and their figures."""
 
+import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.measure.entropy import normalized_entropy
 from sb3_policyflow.benchmark.measure.goals import (
+    GoalReport,
     Trajectories,
     evaluate_goals,
     goal_counts,
@@ -104,6 +107,8 @@ def test_report_by_hand() -> None:
     assert report.entropy == pytest.approx(np.log(3 / 2 ** (2 / 3)) / np.log(6))
     assert report.mean_return == 1.5
     assert str(report).startswith("2 of 6 goals reached (0 2 0 0 1 0; no goal: 1)")
+    kept = json.loads(json.dumps({**asdict(report), "n_goals": report.n_goals}))
+    assert GoalReport.from_summary(kept) == report
 
 
 @pytest.mark.parametrize("goal", range(6))

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,10 +151,46 @@ def test_a_failing_run_is_reported_and_its_log_kept(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_figure_says_what_failed_though_there_is_nothing_to_draw(tmp_path: Path) -> None:
     settings = ["--steps", "10", "--variants", "a-ppo", "--out", str(tmp_path)]
-    # No evaluation after -1 episodes: the training fails.
-    outcome = benchmark("multigoal", *settings, "--episodes", "-1")
+    # Where the curve would go there is a folder: the training fails.
+    (tmp_path / "a-ppo" / "MultiGoal-v0" / "seed-0.csv").mkdir(parents=True)
+    outcome = benchmark("multigoal", *settings, "--evaluations", "1", "--episodes", "1")
     assert outcome.returncode == 2
     assert "failed: a-ppo MultiGoal-v0 seed 0\nNo results in" in outcome.stderr
+
+
+NUMBERS = {
+    "run": ("--steps", "--evaluations", "--episodes", "--jobs", "--threads", "--seeds"),
+    "multigoal": ("--steps", "--evaluations", "--seeds"),
+    "imitation": ("--steps", "--evaluations", "--seeds"),
+    "agent": ("--steps", "--episodes", "--seeds"),
+    "demo": ("--steps", "--seed"),
+    "card": ("--episodes",),
+    "speed": ("--repetitions", "--threads"),
+    "environments": ("--num-envs", "--seconds"),
+}
+REQUIRED = {"run": ["--envs", "Pendulum-v1", "--steps", "10"], "card": ["model", "--env", "a-v0"]}
+
+
+@pytest.mark.parametrize(
+    ("subcommand", "option"), [(name, option) for name in NUMBERS for option in NUMBERS[name]]
+)
+def test_numbers_that_make_no_sense_are_refused_before_a_training(
+    subcommand: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    number = "-1" if option in ("--seed", "--seeds") else "0"
+    with pytest.raises(SystemExit) as exit_of:
+        main([subcommand, *REQUIRED.get(subcommand, []), option, number])
+    assert exit_of.value.code == 2
+    said = capsys.readouterr().err
+    assert f"argument {option}: must be at least" in said
+    assert said.endswith(f", got {number}\n")
+
+
+@pytest.mark.parametrize("steps", ["inf", "nan", "1e400", "many"])
+def test_steps_without_an_end_are_refused(steps: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--envs", "Pendulum-v1", "--steps", steps])
+    assert "argument --steps: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("subcommand", ["run", "playground"])
@@ -177,6 +214,36 @@ def test_a_misspelt_hyperparameter_is_refused_before_a_training(
         with pytest.raises(SystemExit, match=r"no hyperparameter 'n_epoch': did you mean n_epochs"):
             main(["run", *settings, "--algos", algo, "--hyperparams", f"{name}:4"])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_hyperparameter_without_json_is_refused_before_a_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--envs", "Pendulum-v1", "--steps", "10", "--out", str(tmp_path), "--algos", "ppo"]
+    assert main(["run", *settings, "--hyperparams", "policy_kwargs:dict(a=dict)"]) == 2
+    said = capsys.readouterr().err
+    assert "policy_kwargs:{'a': <class 'dict'>} cannot be written to a JSON file" in said
+    assert "\"policy_kwargs:'dict(...)'\"" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_hyperparameters_are_the_same_after_saving(tmp_path: Path) -> None:
+    """JSON has lists alone, and a file may be older than the newest field of a run."""
+    made = Run("a", "ppo", "Env-v0", 3, 10, {"log_std_bounds": (-2.0, 0.0), "kwargs": {"a": (1,)}})
+    Result(made, {"final": {}}, []).save(tmp_path)
+    assert made.is_done(tmp_path)
+    path = made.path(tmp_path, ".json")
+    kept = json.loads(path.read_text())
+    del kept["run"]["keep_visits"]
+    path.write_text(json.dumps(kept))
+    assert made.is_done(tmp_path)
+    assert load_results(tmp_path)[0].run.keep_visits is False
+    with pytest.raises(BenchmarkError, match="was made with other settings"):
+        replace(made, hyperparams={"log_std_bounds": (-1.0, 0.0)}).is_done(tmp_path)
+    kept["run"]["newer"] = 1
+    path.write_text(json.dumps(kept))
+    with pytest.raises(BenchmarkError, match=r"of another version of this package .*'newer'"):
+        made.is_done(tmp_path)
 
 
 def test_how_far_a_training_is_by_its_log(tmp_path: Path) -> None:

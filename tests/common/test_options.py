@@ -106,6 +106,83 @@ def test_former_names(
         assert not former.keys() & vars(one).keys() - present.keys() - {"desired_kl"}
 
 
+TRIGFLOW: dict[str, Any] = {"path": "trigflow"}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "options", "message"),
+    [
+        (PolicyFlow, {**TRIGFLOW, "interpolant": "rectified"}, "leave out path"),
+        (
+            PolicyFlow,
+            {"interpolant": "rectified", "policy_kwargs": TRIGFLOW},
+            r"Give \['interpolant'\] to PolicyFlow or in policy_kwargs, not to both",
+        ),
+        (
+            PolicyFlow,
+            {**TRIGFLOW, "policy_kwargs": {"interpolant": "rectified"}},
+            r"Give \['interpolant'\] to PolicyFlow or in policy_kwargs, not to both",
+        ),
+        (PolicyFlow, {"policy_kwargs": {**TRIGFLOW, "interpolant": "rectified"}}, "leave out path"),
+        (
+            DPPO,
+            {"policy_kwargs": {"initialisation": "glorot", "initialization": "zero"}},
+            "initialisation is now initialization, and both are given: leave out initialisation",
+        ),
+        (FPO, {"n_probes": 3, "n_mc_samples": 3}, "leave out n_probes"),
+        (
+            FPO,
+            {"lr_factor": 1.2, "lr_adaptation_kwargs": {"factor": 1.3}},
+            "lr_factor is now lr_adaptation_kwargs with the key factor",
+        ),
+    ],
+    ids=str,
+)
+def test_what_is_given_under_both_names_is_refused(
+    algorithm: type[Any], options: dict[str, Any], message: str
+) -> None:
+    for policy in ("MlpPolicy", algorithm.policy_aliases["MlpPolicy"]):
+        with pytest.raises(ValueError, match=message):
+            algorithm(policy, "Pendulum-v1", **SMALL, **options)
+
+
+def test_former_names_and_present_ones_of_other_keys_go_together() -> None:
+    with pytest.warns(DeprecationWarning, match="lr_factor is now"):
+        model = FPO(
+            "MlpPolicy",
+            "Pendulum-v1",
+            **SMALL,
+            lr_factor=1.2,  # type: ignore[call-arg]
+            lr_adaptation_kwargs={"margin": 3.0},
+        )
+    assert model.lr_adaptation_kwargs == {"factor": 1.2, "margin": 3.0}
+
+
+class WithOwnPath(PolicyFlow.policy_base):  # type: ignore[name-defined,misc]
+    """Has an option of its own that was once the name of another."""
+
+    def __init__(self, *args: Any, path: str, **kwargs: Any) -> None:
+        self.own_path = path
+        super().__init__(*args, **kwargs)
+
+
+def test_a_policy_of_ones_own_may_have_an_option_of_a_former_name() -> None:
+    own = {"path": "mine", "interpolant": "trigflow"}
+    policy: Any = PolicyFlow(WithOwnPath, "Pendulum-v1", **SMALL, policy_kwargs=own).policy
+    assert (policy.own_path, policy.interpolant) == ("mine", "trigflow")
+
+
+def test_both_names_are_refused_when_loading(tmp_path: Path) -> None:
+    for algorithm, former, present in (
+        (PolicyFlow, {"path": "trigflow"}, {"interpolant": "rectified"}),
+        (FPO, {"n_probes": 3}, {"n_mc_samples": 4}),
+    ):
+        algorithm("MlpPolicy", "Pendulum-v1", **SMALL).save(tmp_path / "model")
+        options: dict[str, Any] = {**former, **present}
+        with pytest.raises(ValueError, match="and both are given: leave out"):
+            algorithm.load(tmp_path / "model", **options)
+
+
 def test_former_names_when_loading(tmp_path: Path) -> None:
     PolicyFlow("MlpPolicy", "Pendulum-v1", desired_kl=0.01, **SMALL).save(tmp_path / "model")
     loaded = PolicyFlow.load(tmp_path / "model", lr_factor=1.25)

@@ -83,6 +83,32 @@ def test_what_cannot_be_shared_out_is_refused() -> None:
         assert sentence.startswith("batch_size=15 counts for all 2 ranks together")
 
 
+@pytest.mark.parametrize(
+    ("name", "of_rank_0", "of_rank_1"),
+    [
+        ("clip_range", "0.1", "0.3"),
+        ("clip_range_vf", "None", "0.2"),
+        ("learning_rate", "0.001", "'0.001 at first and 0.0 at the end'"),
+        ("n_flow_steps", "2", "3"),
+        ("log_std_bounds", "[-2.0, 0.0]", "[-1.0, 0.0]"),
+        ("lr_adaptation_kwargs", "{'factor': 1.2}", "{'factor': 1.3}"),
+        ("policy_kwargs", "{", "{"),
+    ],
+)
+def test_other_options_than_those_of_the_other_ranks_are_refused(
+    name: str, of_rank_0: str, of_rank_1: str
+) -> None:
+    said = f"All ranks must have the same {name}, but rank 0 has {of_rank_0}"
+    first, second = run_ranks(2, workers.refused_option, name)
+    assert first.startswith(said), first
+    assert f" and rank 1 has {of_rank_1}" in first
+    assert f"All ranks must have the same {name}, but rank 1 has {of_rank_1}" in second
+
+
+def test_ranks_with_objects_of_their_own_that_are_alike_train() -> None:
+    assert run_ranks(2, workers.run_alike) == ["no error", "no error"]
+
+
 def test_resumed_ranks_end_as_the_uninterrupted_ones(tmp_path: Path) -> None:
     first, second = run_ranks(2, workers.each_algorithm, workers.run_whole, tmp_path)
     assert len({*first, *second}) == 6  # each rank has environments and draws of its own

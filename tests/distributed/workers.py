@@ -13,6 +13,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.distributed.group import process_group
@@ -179,6 +180,35 @@ def refused(different_envs: bool) -> str:
     n_envs = 2 + current().rank if different_envs else 2
     model = model_of(make_vec_env("Pendulum-v1", n_envs), batch_size=16 if different_envs else 15)
     return _sentence(model)
+
+
+DIFFERENT: dict[str, Any] = {
+    "clip_range": (0.1, 0.3),
+    "clip_range_vf": (None, 0.2),
+    "learning_rate": (lambda _: 1e-3, lambda remaining: 1e-3 * remaining),
+    "n_flow_steps": (2, 3),
+    "log_std_bounds": ((-2.0, 0.0), (-1.0, 0.0)),
+    "lr_adaptation_kwargs": ({"factor": 1.2}, {"factor": 1.3}),
+    "policy_kwargs": (
+        {**NETWORKS, "activation_fn": nn.Tanh},
+        {**NETWORKS, "activation_fn": nn.ELU},
+    ),
+}
+"""What rank 0 and rank 1 are given, by option."""
+
+
+def refused_option(name: str) -> str:
+    """The sentence with which a run is refused whose ranks have other values of an option."""
+    options = {**SIZES, "policy_kwargs": NETWORKS, name: DIFFERENT[name][current().rank]}
+    return _sentence(PolicyFlow("MlpPolicy", make_vec_env("Pendulum-v1", 2), **options))
+
+
+def run_alike() -> str:
+    """Learn with options of which each process has objects of its own, which are alike."""
+    kwargs = {**NETWORKS, "optimizer_kwargs": {"betas": (0.9, 0.99)}}
+    kwargs["features_extractor_kwargs"] = {}
+    options = {**SIZES, "policy_kwargs": kwargs, "clip_range": lambda remaining: 0.1 * remaining}
+    return _sentence(PolicyFlow("MlpPolicy", make_vec_env("Pendulum-v1", 2), **options))
 
 
 # Files

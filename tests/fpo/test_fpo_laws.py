@@ -9,6 +9,7 @@ from sb3_policyflow import FPO
 from sb3_policyflow.common.losses import SURROGATES
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.tree import rows
+from sb3_policyflow.common.update import UpdateMetrics
 from sb3_policyflow.fpo.fpo import FPOUpdate, MonteCarloSamples
 from sb3_policyflow.fpo.policies import FPOPolicy
 from tests.helpers import collected, perturb
@@ -86,6 +87,18 @@ def test_losses_and_differences_are_clamped() -> None:
     assert rollout.drawn.reference_losses.max().item() == 0.5
     perturb(model.policy.velocity, 1.0)
     assert log_ratio(model, rollout).abs().max().item() == 0.25
+
+
+@pytest.mark.parametrize("mc_average", ["loss", "objective"])
+def test_the_greatest_log_ratio_is_logged_as_it_was_before_the_clamp(mc_average: str) -> None:
+    model, rollout = with_draws(mc_average=mc_average)
+    perturb(model.policy.velocity, 1.0)
+    expected = log_ratio(model, rollout).abs().max().item()
+    model.difference_clamp = 0.25
+    assert log_ratio(model, rollout).abs().max().item() <= 0.25 < expected
+    metrics = UpdateMetrics()
+    FPOUpdate(model, rollout).loss(rollout, metrics)
+    assert metrics.summary()["log_ratio_max"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_f
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn.utils import parameters_to_vector
 
-from sb3_policyflow import PolicyFlow
+from sb3_policyflow import FPO, PolicyFlow
 from sb3_policyflow.flows import Interpolant
 from sb3_policyflow.policyflow.policies import PolicyFlowPolicy
 
@@ -92,6 +92,20 @@ def test_models_without_options_have_the_defaults_of_0_1(
     if algorithm.__name__ != "DPPO":
         expected = {"PolicyFlow": (1.0, 12), "FPO": (None, 10)}[algorithm.__name__]
         assert (getattr(policy, "latent_std", None), policy.n_flow_steps) == expected
+
+
+def test_options_under_their_present_names_count_more_than_the_file(tmp_path: Path) -> None:
+    """The file has them under their former names; what it has of others stays."""
+    interpolated = PolicyFlow.load(saved(PolicyFlow, "zip"), interpolant="rectified", device="cpu")
+    assert (interpolated.interpolant, interpolated.n_times) == ("rectified", 3)
+    sampled = FPO.load(saved(FPO, "zip"), n_mc_samples=5, device="cpu")
+    assert (sampled.n_mc_samples, sampled.mc_average) == (5, "objective")
+    adapted = FPO.load(saved(FPO, "zip"), lr_adaptation_kwargs={"factor": 1.9}, device="cpu")
+    assert adapted.lr_adaptation_kwargs == {"factor": 1.9}
+    adapted.save(tmp_path / "again")
+    assert FPO.load(tmp_path / "again", device="cpu").lr_adaptation_kwargs == {"factor": 1.9}
+    one = FPO.load(saved(FPO, "zip"), lr_factor=1.9, device="cpu").lr_adaptation_kwargs
+    assert (one["factor"], one["window"]) == (1.9, "update")
 
 
 class OwnDefault(PolicyFlowPolicy):

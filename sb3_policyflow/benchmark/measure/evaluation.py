@@ -18,13 +18,18 @@ EVALUATION_SEED = 1_000_000
 """Far from the seeds of trainings; every evaluation starts from the same states."""
 
 STOCHASTIC, LATENT_ONLY, DETERMINISTIC = "stochastic", "latent-only", "deterministic"
-MODES = (STOCHASTIC, LATENT_ONLY, DETERMINISTIC)
+MODES = {
+    STOCHASTIC: "actions drawn as in training",
+    LATENT_ONLY: "latents drawn, no other noise",
+    DETERMINISTIC: "one action for each observation, no noise",
+}
+"""How a model can act, and what that means."""
 
 
 def modes(model: BaseAlgorithm) -> tuple[str, ...]:
     """How a model can act: with all its randomness, with that of its latents only, with none."""
     if isinstance(model.policy, FlowPolicy):
-        return STOCHASTIC, LATENT_ONLY, DETERMINISTIC
+        return tuple(MODES)
     return STOCHASTIC, DETERMINISTIC
 
 

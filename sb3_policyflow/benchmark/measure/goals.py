@@ -5,9 +5,10 @@ its options reaches each with probability 1/6. The paper shows this as a picture
 trajectories; here it is also a number, the normalized entropy over goals.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,12 @@ class GoalReport:
     n_missed: int
     entropy: float
     mean_return: float
+
+    @classmethod
+    def from_summary(cls, summary: Mapping[str, Any]) -> "GoalReport":
+        """The report that a run's results have kept, among what else they say of its goals."""
+        of_all = summary["n_missed"], summary["entropy"], summary["mean_return"]
+        return cls(tuple(summary["counts"]), *of_all)
 
     @property
     def n_goals(self) -> int:

@@ -20,7 +20,7 @@ import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_policyflow.benchmark.errors import require_env
+from sb3_policyflow.benchmark.errors import at_least, require_env
 from sb3_policyflow.benchmark.measure.provenance import machine
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.envs import PLAYGROUND, PLAYGROUND_TASKS
@@ -125,8 +125,10 @@ def _rates(timing: Timing) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("ids", nargs="*", help="environments; default: the ten of Playground")
-    parser.add_argument("--num-envs", type=int, nargs="+", default=DEFAULT_SIZES)
-    parser.add_argument("--seconds", type=float, default=3.0, help="of steps each; default: 3")
+    parser.add_argument("--num-envs", type=at_least(1), nargs="+", default=DEFAULT_SIZES)
+    parser.add_argument(
+        "--seconds", type=at_least(0.01, float), default=3.0, help="of steps each; default: 3"
+    )
     parser.add_argument("--out", type=Path, help="a JSON file for all figures")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_policyflow.benchmark.errors import BenchmarkError
+from sb3_policyflow.benchmark.errors import BenchmarkError, at_least
 from sb3_policyflow.benchmark.measure.provenance import machine
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.speed.rivals import command as rivals
@@ -156,8 +156,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     choices, default = ", ".join(CHOICES), ", ".join(DEFAULT)
     what = f"of {choices}, or rivals alone; default: {default}"
     parser.add_argument("what", nargs="*", help=what)
-    parser.add_argument("--repetitions", type=int, default=5, help="default: 5")
-    parser.add_argument("--threads", type=int, help="torch's threads; default: torch's own")
+    parser.add_argument("--repetitions", type=at_least(1), default=5, help="default: 5")
+    parser.add_argument("--threads", type=at_least(1), help="torch's threads; default: torch's own")
     parser.add_argument("--device", default="auto", help='of "isaaclab"; default: a GPU if any')
     parser.add_argument("--out", type=Path, help="a JSON file for all figures")
     parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
