@@ -130,7 +130,7 @@ def test_other_dictionaries_are_other_demonstrations() -> None:
         ({}, {"n_flow_steps": 3}),
         ({}, {"policy_kwargs": {"net_arch": [9]}}),
     ],
-    ids=str,
+    ids=["rate", "function", "batch size", "algorithm", "steps", "networks"],
 )
 def test_a_checkpoint_of_other_options_or_networks_is_refused(
     options: dict[str, Any], model: dict[str, Any], tmp_path: Path
