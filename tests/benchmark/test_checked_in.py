@@ -26,7 +26,7 @@ def n_done(folder: str, variants: Variants, n_evaluations: int, steps: int, **fi
     return sum(run.is_done(RESULTS / folder) for run in runs)
 
 
-@pytest.mark.parametrize("name", ["classic", "pendulum", "halfcheetah"])
+@pytest.mark.parametrize("name", ["classic", "mujoco", "pendulum", "halfcheetah"])
 def test_tables_are_those_of_the_results(name: str) -> None:
     text = report(load_results(RESULTS / name))
     assert text == (RESULTS / name / "table.md").read_text(encoding="utf-8")
