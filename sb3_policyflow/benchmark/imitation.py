@@ -227,7 +227,7 @@ def _draw_trajectories(folder: Path, results: Sequence[Result]) -> None:
     trajectories = {}
     for name in distinct(results, "name"):
         style, algo = name.split("-")
-        title = f"{algo} from {style} demonstrations"
+        title = f"{algo}, {style}"
         trajectories[f"{title}: cloned"] = load_trajectories(first[name], folder, "-cloned.npz")
         trajectories[f"{title}: trained"] = load_trajectories(first[name], folder)
     goals_figure(trajectories, n_columns=4).savefig(folder / "multigoal.png")
