@@ -64,8 +64,8 @@ class RecordBufferMixin(RolloutBuffer):
         super().add(obs, action, reward, episode_start, value, self._no_log_prob)
 
     def _allocate(self, record: Any) -> None:
-        taken = [name for name in record._fields if hasattr(self, name)]
-        if set(taken) - set(self._record_fields):
+        new = (name for name in record._fields if name not in self._record_fields)
+        if taken := [name for name in new if hasattr(self, name)]:
             raise TypeError(
                 f"A field of {type(record).__name__} cannot have the name of an attribute of "
                 f"{type(self).__name__}: rename {', '.join(taken)}."

@@ -95,17 +95,18 @@ class FPOUpdate(FlowUpdate):
     def terms(self, batch: FlowRolloutBufferSamples, features: th.Tensor) -> PolicyTerms:
         """Ratio from the change of the flow-matching loss (FPO, equation of the ratio)."""
         losses = self.losses(batch, features)
-        log_ratio = batch.drawn.reference_losses - losses
-        unclamped, clamp = log_ratio.detach(), self.algorithm.difference_clamp
-        if clamp is not None:
-            log_ratio = log_ratio.clamp(-clamp, clamp)
-        if self.algorithm.mc_average == "loss":
-            log_ratio, unclamped = log_ratio.mean(dim=1), unclamped.mean(dim=1)
+        change, clamp = batch.drawn.reference_losses - losses, self.algorithm.difference_clamp
+        log_ratio = self._averaged(change if clamp is None else change.clamp(-clamp, clamp))
+        unclamped = None if clamp is None else self._averaged(change.detach())
         # Entropy of the actions, from samples
         regularizer, metrics = self.entropy_bonus.regularizer(self.policy, features)
         metrics["flow_matching_loss"] = losses.mean()
         kl = ratio_divergence(log_ratio)
         return PolicyTerms(log_ratio, kl, regularizer, metrics, unclamped)
+
+    def _averaged(self, changes: th.Tensor) -> th.Tensor:
+        """Log ratios (n, ...) from changes of the losses (n, k)."""
+        return changes.mean(dim=1) if self.algorithm.mc_average == "loss" else changes
 
 
 class FPO(FlowOnPolicyAlgorithm):

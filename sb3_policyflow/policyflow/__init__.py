@@ -4,9 +4,7 @@ from sb3_policyflow.policyflow.policies import (
     MultiInputFlowPolicy,
     PolicyFlowPolicy,
 )
-from sb3_policyflow.policyflow.policies import (
-    FlowPolicy as FlowPolicy,
-)
+from sb3_policyflow.policyflow.policies import FlowPolicy as FlowPolicy  # its former name
 from sb3_policyflow.policyflow.policyflow import PolicyFlow
 
 __all__ = [
