@@ -11,6 +11,7 @@ from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
+from sb3_policyflow.common.former_names import keep_former_defaults
 from sb3_policyflow.common.minibatches import (
     FlowRolloutBufferSamples,
     Minibatches,
@@ -199,7 +200,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         own, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self.policy_options}
         super()._setup_model()
         self.policy_kwargs = own
-        names.keep_former_defaults(self)
+        keep_former_defaults(self)
         self.known_policy_options = options.values_on_policy(self)
         self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:

@@ -11,9 +11,9 @@ import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.former_names import check_given_once, with_present_names
 from sb3_policyflow.common.names import (
     FOREIGN_ARGUMENTS,
-    check_given_once,
     check_names,
     check_saved_by,
     named_parameters,
@@ -21,7 +21,6 @@ from sb3_policyflow.common.names import (
     policy_parameters,
     settable_options,
     unknown_argument,
-    with_present_names,
 )
 from sb3_policyflow.common.schedules import (
     Coefficient,
@@ -190,36 +189,6 @@ class PolicyOption:
         except ValueError:
             setattr(policy, name, former)
             raise
-
-
-def accepts_former_names(**former_names: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
-    """Let a policy take options under their former names too, with a warning.
-
-    Where it does not hand others on, those that it does not have are refused with a sentence.
-
-    :param former_names: Present names by former ones.
-    """
-
-    def extend(init: Callable[P, None]) -> Callable[P, None]:
-        parameters = inspect.signature(init).parameters
-        hands_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-
-        @functools.wraps(init)
-        def extended(*args: P.args, **options: P.kwargs) -> None:
-            # A present name has been set later than a former one in policy_kwargs.
-            given = {
-                name: options[name] for name in options if former_names.get(name) not in options
-            }
-            present = with_present_names(given, former_names)
-            for name in present.keys() - parameters.keys() if not hands_on else ():
-                owner = type(args[0])
-                raise unknown_argument(owner.__name__, name, policy_parameters(owner))
-            cast("Callable[..., None]", init)(*args, **present)
-
-        vars(extended)["former_names"] = former_names
-        return extended
-
-    return extend
 
 
 def values_on_policy(model: Any) -> dict[str, Any]:

@@ -18,14 +18,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.former_names import FormerAttribute, accepts_former_names
 from sb3_policyflow.common.names import (
-    FormerAttribute,
     WithoutLikelihood,
     check_overridden_methods,
     own_options,
 )
 from sb3_policyflow.common.optimization import make_optimizer
-from sb3_policyflow.common.options import accepts_former_names
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
 from sb3_policyflow.kernels import KernelCritic, are_in_mode, has_values, make_velocity_field

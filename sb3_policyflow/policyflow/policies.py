@@ -12,7 +12,8 @@ from torch import nn
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.continuous import ContinuousFlowPolicy
-from sb3_policyflow.common.options import FlowOptions, accepts_former_names
+from sb3_policyflow.common.former_names import accepts_former_names
+from sb3_policyflow.common.options import FlowOptions
 from sb3_policyflow.flows import INTERPOLANTS, SOLVERS, Flow
 from sb3_policyflow.flows.bounds import half_ranges
 
