@@ -12,6 +12,7 @@ from typing_extensions import Self
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.former_names import keep_former_defaults
+from sb3_policyflow.common.graphs import record_losses
 from sb3_policyflow.common.minibatches import (
     FlowRolloutBufferSamples,
     Minibatches,
@@ -39,7 +40,7 @@ from sb3_policyflow.common.update import (
 )
 from sb3_policyflow.device import environments
 from sb3_policyflow.distributed.ranks import Ranks, join, training_of
-from sb3_policyflow.kernels import reason_kernels_are_off, shares_cores
+from sb3_policyflow.kernels import reason_training_is_slow, shares_cores
 from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
 from sb3_policyflow.resilience.training import LearnArguments
 
@@ -252,6 +253,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         rollout = self._rollout()
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
+        record_losses(update)
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()
@@ -318,8 +320,8 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""
         self.n_rollouts += 1
-        if self.n_rollouts == 1 and (reason := reason_kernels_are_off(self.policy)):
-            self.logger.info(f"The compiled kernels are off, and training is slower: {reason}.")
+        if self.n_rollouts == 1 and (reason := reason_training_is_slow(self.policy)):
+            self.logger.info(reason)
         kept = self.rollout_buffer.values, self.rollout_buffer.returns
         arrays = (th.as_tensor(each, device="cpu").numpy().flatten() for each in kept)
         logged: dict[str, Any] = {"approx_kl": approx_kl.item(), "loss": loss.item()}

@@ -107,12 +107,15 @@ class RecordBufferMixin(RolloutBuffer):
     ) -> Minibatches:
         """Go through ``samples`` once, in random order.
 
-        The order is the one in which SB3's buffer gives back its transitions.
+        The order is the one in which SB3's buffer gives back its transitions; a GPU draws its own.
 
         :param samples: What :meth:`samples` returned, perhaps with something drawn for each.
         :param batch_size: Samples in a minibatch; all of them if not given.
         """
         n_samples = self.buffer_size * self.n_envs
+        if self.device.type == "cuda":
+            drawn = th.randperm(n_samples, device=self.device)
+            return Minibatches(samples, drawn, batch_size or n_samples)
         order = np.random.permutation(n_samples)
         # SB3 numbers transitions environment by environment, ``samples`` step by step.
         indices = order % self.buffer_size * self.n_envs + order // self.buffer_size

@@ -27,7 +27,13 @@ from sb3_policyflow.common.names import (
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
 from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
-from sb3_policyflow.kernels import KernelCritic, are_in_mode, has_values, make_velocity_field
+from sb3_policyflow.kernels import (
+    GraphMemory,
+    KernelCritic,
+    are_in_mode,
+    has_values,
+    make_velocity_field,
+)
 from sb3_policyflow.resilience.finite import check_actions
 
 NetArch = list[int] | dict[str, list[int]]
@@ -174,6 +180,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         del self.action_net, self.action_dist, self.log_std
         self._build_actor()
         self._kernel_critic = KernelCritic()
+        self.graph_memory = GraphMemory()
         fixed = "velocity.time_embedding.frequencies"  # of the velocity, and of a copy of it
         learned = (p for name, p in self.named_parameters() if not name.endswith(fixed))
         self.optimizer = make_optimizer(

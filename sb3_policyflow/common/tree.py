@@ -7,7 +7,7 @@ import torch as th
 
 T = TypeVar("T")
 CHUNK = 8192
-"""Rows evaluated at a time where rows are small."""
+"""Small rows that a CPU evaluates at a time. A GPU is given as many as in training."""
 SMALL_ROW = 1024
 """Numbers in a row up to which it is small. An image has more, and a features extractor makes
 several times as many of them: of images, no more are evaluated at a time than training does."""
@@ -68,11 +68,14 @@ def in_chunks(function: Callable[[T], th.Tensor], tree: T, batch_size: int) -> t
 
     :param function: Maps k rows of ``tree`` to a tensor (k, ...).
     :param tree: Tensors (n, ...) in dictionaries and tuples.
-    :param batch_size: How many large rows may be evaluated at a time, at most.
+    :param batch_size: How many large rows may be evaluated at a time, at most, as in training.
     :return: The results in order, shape (n, ...).
     """
-    n_rows = len(next(tensors(tree)))
+    first_tensor = next(tensors(tree))
+    n_rows = len(first_tensor)
     size = CHUNK if are_small(tree) else min(batch_size, CHUNK)
+    if first_tensor.is_cuda:
+        size = max(size, batch_size)
     with th.no_grad():
         first = function(rows(tree, slice(0, size)))
         if size >= n_rows:

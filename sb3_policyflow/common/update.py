@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch as th
 
@@ -10,6 +10,9 @@ from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_valu
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
 from sb3_policyflow.common.schedules import is_zero
 from sb3_policyflow.kernels import has_fixed_features
+
+Metrics = Mapping[str, th.Tensor] | Mapping[str, float]
+"""Metrics of one minibatch by name: numbers, or tensors without dimensions."""
 
 
 class PolicyTerms(NamedTuple):
@@ -46,8 +49,8 @@ class CompiledTerms(NamedTuple):
 
     loss: Loss
     kl: th.Tensor
-    means: dict[str, float]
-    maxima: dict[str, float]
+    means: Metrics
+    maxima: Metrics
 
 
 EvaluateRows = Callable[[slice], CompiledTerms | None]
@@ -66,11 +69,21 @@ class FlowUpdate(ABC):
     Log ratios beyond ``log_ratio_clamp`` have no gradient; None for no bound.
     ``surrogate_weights`` weigh the surrogates of a sample, of the trailing shape of a log ratio;
     None for 1. If ``trains_actor`` is False, only the critic learns from the rollout. If there is a
-    ``compiled_loss``, it takes the place of :meth:`loss` where it can.
+    ``compiled_loss``, it takes the place of :meth:`loss` where it can, and so does a
+    ``recorded_loss``, a graph of it on a GPU. An algorithm whose formulas start the same operations
+    for every minibatch, and wait for none, says so as ``class MyUpdate(FlowUpdate,
+    has_known_formulas=True)``.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
     """
+
+    has_known_formulas: ClassVar[bool] = False
+    """Whether :meth:`loss` may be recorded; a subclass may have any, and must say it itself."""
+
+    def __init_subclass__(cls, has_known_formulas: bool = False) -> None:
+        super().__init_subclass__()
+        cls.has_known_formulas = has_known_formulas
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
@@ -79,6 +92,7 @@ class FlowUpdate(ABC):
         bounds_values = algorithm.clip_range_vf is not None
         self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
         self.compiled_loss: CompiledLoss | None = None
+        self.recorded_loss: Callable[[FlowRolloutBufferSamples], CompiledTerms] | None = None
         self.batch_size: int = algorithm.ranks.share("batch_size", algorithm.batch_size)
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
@@ -109,7 +123,7 @@ class FlowUpdate(ABC):
         :param minibatches: Minibatches, with what was drawn for them.
         :param metrics: Takes what is to be logged.
         """
-        evaluate = self._prepared(minibatches.shuffled)
+        evaluate = self._prepared(minibatches)
         for part in minibatches.parts:
             compiled = None if evaluate is None else evaluate(part)
             if compiled is None:
@@ -117,8 +131,11 @@ class FlowUpdate(ABC):
             else:
                 yield self._logged(compiled, metrics)
 
-    def _prepared(self, samples: FlowRolloutBufferSamples | None) -> EvaluateRows | None:
-        """What evaluates minibatches of some samples, if no step changes their features."""
+    def _prepared(self, minibatches: Minibatches) -> EvaluateRows | None:
+        """What evaluates minibatches: a graph, or a kernel if no step changes their features."""
+        recorded, samples = self.recorded_loss, minibatches.shuffled
+        if recorded is not None:
+            return lambda part: recorded(minibatches.at(part))
         is_known = self.compiled_loss is not None and type(self).loss is FlowUpdate.loss
         if samples is None or not is_known or not has_fixed_features(self.policy):
             return None
@@ -213,15 +230,21 @@ class UpdateMetrics:
         self._to_average: dict[str, list[Any]] = {}
         self._to_maximize: dict[str, list[Any]] = {}
 
-    def add_means(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
+    def add_means(self, metrics: Metrics) -> None:
         """Add metrics of one minibatch, tensors without dimensions or numbers, to be averaged."""
         for name, value in metrics.items():
             self._append(self._to_average.setdefault(name, []), value)
 
-    def add_maxima(self, metrics: Mapping[str, th.Tensor] | Mapping[str, float]) -> None:
+    def add_maxima(self, metrics: Metrics) -> None:
         """Add metrics of one minibatch of which the greatest counts."""
         for name, value in metrics.items():
             self._append(self._to_maximize.setdefault(name, []), value)
+
+    def last(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Those to average and those of which the greatest counts, as they were added last."""
+        kinds = (self._to_average, self._to_maximize)
+        means, maxima = ({name: values[-1] for name, values in kind.items()} for kind in kinds)
+        return means, maxima
 
     @staticmethod
     def _append(values: list[Any], value: th.Tensor | float) -> None:

@@ -66,8 +66,9 @@ class Flow(NamedTuple):
 
     def times(self) -> th.Tensor:
         """The solver's time grid on the device of the field (paper: the discrete time grid)."""
-        times = solver_times(self.solver, self.n_steps, self.interpolant.end_time)
-        return times.to(self.velocity.time_embedding.frequencies)
+        like = self.velocity.time_embedding.frequencies
+        end_time = self.interpolant.end_time
+        return solver_times(self.solver, self.n_steps, end_time, like.device).to(like.dtype)
 
     @property
     def n_evaluations(self) -> int:

@@ -123,7 +123,7 @@ def integrate_folded(
     :param end_time: T, where the flow ends.
     :return: phi, of the shape of ``latents``.
     """
-    times = solver_times(solver, n_steps, end_time).to(latents)
+    times = solver_times(solver, n_steps, end_time, latents.device).to(latents.dtype)
     first = fold(field, times)
     shift = features @ first.features.T
     rest = nn.Sequential(*field.layers[1:])

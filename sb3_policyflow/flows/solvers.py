@@ -158,7 +158,9 @@ SOLVERS: dict[str, Solver] = {
 }
 
 
-def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
+def solver_times(
+    solver: str, n_steps: int, end_time: float = 1.0, device: th.device | str = "cpu"
+) -> th.Tensor:
     """Every time at which a solver looks, end points included (paper: the discrete time grid).
 
     >>> solver_times("midpoint", 2).tolist()
@@ -167,13 +169,14 @@ def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
     :param solver: Name of the solver.
     :param n_steps: Number of equal steps, at least 1.
     :param end_time: Where the integration ends.
+    :param device: Where the times are made.
     :return: Times in increasing order, float64, shape (n_steps * grid_points_per_step + 1,).
     :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
     """
     if n_steps < 1:
         raise ValueError(f"A flow needs at least one solver step, got n_flow_steps={n_steps}.")
     n_parts = choose("solver", solver, SOLVERS).grid_points_per_step * n_steps
-    return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64, device="cpu")
+    return th.linspace(0.0, end_time, n_parts + 1, dtype=th.float64, device=device)
 
 
 def integrate(
@@ -200,5 +203,5 @@ def integrate(
     :return: phi, the end points, of the shape of ``latents``.
     :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
     """
-    times = solver_times(solver, n_steps, end_time).to(latents)
+    times = solver_times(solver, n_steps, end_time, latents.device).to(latents.dtype)
     return SOLVERS[solver].solve(velocity, latents, times)

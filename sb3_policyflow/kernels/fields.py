@@ -1,5 +1,6 @@
 """Velocity fields evaluated, differentiated and integrated by kernels."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from torch import nn
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.kernels.compiler import note_fallback
 from sb3_policyflow.kernels.flow import FlowPlan, FlowPlans
+from sb3_policyflow.kernels.graphs import FlowGraphs
 from sb3_policyflow.kernels.inspection import (
     KernelView,
     Layer,
@@ -106,10 +108,15 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
         super().__init__(*args, **kwargs)
         self._view = KernelView(_read_field)
         self._plans = FlowPlans()
+        self._graphs = FlowGraphs(_read_field)
 
     def parts(self) -> FieldParts | str:
         """What the field consists of now, or the reason why kernels cannot work on it."""
         return self._view.of(self)
+
+    def reason_graphs_are_off(self) -> str | None:
+        """Why no graph of a GPU can have the field; None if one can."""
+        return self._graphs.reason_off(self)
 
     def forward(self, points: th.Tensor, times: th.Tensor, features: th.Tensor) -> th.Tensor:
         parts = self.parts()
@@ -144,9 +151,12 @@ class KernelVelocityField(VelocityField, has_formula_of_paper=True):
             plan = self._plan(latents, features, solver, n_steps, end_time)
             if plan is not None:
                 return plan.transport(latents, features)
-        return super().integrate(
-            latents, features, solver=solver, n_steps=n_steps, end_time=end_time
-        )
+        carry = partial(super().integrate, solver=solver, n_steps=n_steps, end_time=end_time)
+        endpoints = None
+        if latents.is_cuda and self.has_formula_of_paper:
+            method = (solver, n_steps, end_time)
+            endpoints = self._graphs.run(self, carry, latents, features, method)
+        return carry(latents, features) if endpoints is None else endpoints
 
     def choose_latents(
         self,

@@ -30,9 +30,13 @@ class Layer(NamedTuple):
 
 
 class ModuleInspector:
-    """Reads parameters from modules, and remembers where from."""
+    """Reads parameters from modules, and remembers where from.
 
-    def __init__(self) -> None:
+    :param device: Type of the device that parameters must be on.
+    """
+
+    def __init__(self, device: str = "cpu") -> None:
+        self._device = device
         self._hooks: list[Any] = []
         self._places: list[tuple[Any, str, object]] = []
 
@@ -73,7 +77,7 @@ class ModuleInspector:
         """A parameter of a module."""
         parameter: Any = module._parameters[name]
         self._places.append((module._parameters, name, parameter))
-        require_usable(parameter)
+        require_usable(parameter, device=self._device)
         return parameter
 
     def layer(self, module: nn.Module) -> Layer:
@@ -90,7 +94,7 @@ class ModuleInspector:
         if weight is None or bias is None:
             raise UnsupportedError("a linear layer has no weight or no bias of its own")
         self._places += [(parameters, "weight", weight), (parameters, "bias", bias)]
-        require_usable(weight, bias)
+        require_usable(weight, bias, device=self._device)
         return Layer(weight, bias)
 
     def activation(self, module: nn.Module) -> Activation:
@@ -161,24 +165,27 @@ class KernelView(Generic[P]):
     Threads may share a view: it changes by one assignment of a reading that is complete.
 
     :param read: Reads a module for these kernels, or raises :class:`UnsupportedError`.
+    :param device: Type of the device that the module must be on.
     """
 
-    def __init__(self, read: Callable[[Kernels, ModuleInspector, Any], P]) -> None:
-        self._read = read
+    def __init__(
+        self, read: Callable[[Kernels, ModuleInspector, Any], P], device: str = "cpu"
+    ) -> None:
+        self._read, self._device = read, device
         self._reading: _Reading[P] | None = None
 
     def __reduce__(self) -> Any:
-        return type(self), (self._read,)
+        return type(self), (self._read, self._device)
 
     def of(self, module: Any) -> P | str:
         """The parts of a module as it is now, or the reason why kernels cannot work on it."""
-        kernels = why_torch_must_work() or load_kernels()
+        kernels = why_torch_must_work(self._device) or load_kernels()
         if isinstance(kernels, str):
             note_fallback(kernels)
             return kernels
         reading = self._reading
         if reading is None or not reading.is_current(module):
-            inspector = ModuleInspector()
+            inspector = ModuleInspector(self._device)
             try:
                 parts = self._read(kernels, inspector, module)
             except UnsupportedError as unsupported:
@@ -189,13 +196,16 @@ class KernelView(Generic[P]):
         return reading.parts
 
 
-def why_torch_must_work() -> str | None:
-    """The reason why no kernel can take the place of torch's functions now, whatever the module."""
+def why_torch_must_work(device: str = "cpu") -> str | None:
+    """The reason why no kernel can take the place of torch's functions now, whatever the module.
+
+    :param device: Type of the device that the module is on.
+    """
     # Tensors have no values for those who compile, export or trace.
     if th.compiler.is_compiling() or th._C._get_tracing_state() is not None:
         return "it is being compiled, exported or traced"
     # Within torch.func's transformations tensors stand for others, and autocast wants another type.
-    if th._C._functorch.peek_interpreter_stack() is not None or th.is_autocast_enabled("cpu"):
+    if th._C._functorch.peek_interpreter_stack() is not None or th.is_autocast_enabled(device):
         return "torch.func or autocast is at work"
     if any(GLOBAL_HOOKS):
         return "there are hooks for all modules"
@@ -242,16 +252,17 @@ def are_usable(tensors: Iterable[th.Tensor]) -> bool:
     return True
 
 
-def require_usable(*tensors: th.Tensor) -> None:
+def require_usable(*tensors: th.Tensor, device: str = "cpu") -> None:
     """Refuse tensors that kernels cannot work on.
 
+    :param device: Type of the device that they must be on.
     :raises UnsupportedError: If there is one, see :func:`are_usable`, or one of another class,
         which may have no memory of its own.
     """
     for tensor in tensors:
         if type(tensor) not in TORCHS_OWN:
             raise UnsupportedError(f"a {type(tensor).__name__} takes the place of a parameter")
-        if not tensor.is_cpu:
+        if tensor.device.type != device:
             raise UnsupportedError(f"the policy is on {tensor.device.type}")
         if tensor.dtype is not th.float32:
             raise UnsupportedError(f"parameters are {tensor.dtype}, not torch.float32")

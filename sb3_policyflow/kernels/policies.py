@@ -6,6 +6,10 @@ from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
 from typing import Any
 
+import torch as th
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+
+from sb3_policyflow.flows.folding import has_hooks
 from sb3_policyflow.kernels.critic import read_critic
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.inspection import KernelView
@@ -16,6 +20,9 @@ OF_ACTOR_AND_CRITIC = (
     *("mlp_extractor.value_net.", "value_net."),
 )
 """How the names of their parameters and buffers begin, in a policy that kernels know."""
+
+EXTRACTORS = (FlattenExtractor, NatureCNN, CombinedExtractor)
+"""Features extractors that do the same work whatever they are given."""
 
 
 def reason_kernels_are_off(policy: Any) -> str | None:
@@ -31,6 +38,49 @@ def reason_kernels_are_off(policy: Any) -> str | None:
         return actor
     critic = KernelView(read_critic).of(policy)
     return f"for the critic, {critic}" if isinstance(critic, str) else None
+
+
+def reason_graphs_are_off(policy: Any) -> str | None:
+    """Why an update of a policy on a GPU is not recorded as a graph.
+
+    :param policy: A policy as above.
+    :return: A part of a sentence; None if it is.
+    """
+    if th.is_anomaly_enabled():
+        return "torch looks for anomalies"
+    if not type(policy).__module__.startswith("sb3_policyflow."):
+        return f"{type(policy).__name__} is a policy of your own"
+    if not isinstance(policy.velocity, KernelVelocityField):
+        return f"{type(policy.velocity).__name__} is not a velocity field of kernels"
+    if (reason := policy.velocity.reason_graphs_are_off()) is not None:
+        return reason
+    critic = KernelView(read_critic, "cuda").of(policy)
+    if isinstance(critic, str):
+        return f"for the critic, {critic}"
+    extractors = policy.pi_features_extractor, policy.vf_features_extractor
+    return next(filter(None, map(_why_unknown, extractors)), None)
+
+
+def _why_unknown(extractor: Any) -> str | None:
+    """Why it is not known what a features extractor does."""
+    if type(extractor) not in EXTRACTORS:
+        return f"{type(extractor).__name__} is a features extractor of your own"
+    if any(map(has_hooks, extractor.modules())):
+        return f"{type(extractor).__name__} has hooks"
+    return None
+
+
+def reason_training_is_slow(policy: Any) -> str | None:
+    """Why a policy trains without what makes it fast: kernels on a CPU, graphs on a GPU.
+
+    :param policy: A policy as above.
+    :return: A sentence; None if it has them.
+    """
+    if policy.device.type == "cuda":
+        what, reason = "CUDA graphs are not used", reason_graphs_are_off(policy)
+    else:
+        what, reason = "The compiled kernels are off", reason_kernels_are_off(policy)
+    return None if reason is None else f"{what}, and training is slower: {reason}."
 
 
 def has_fixed_features(policy: Any) -> bool:

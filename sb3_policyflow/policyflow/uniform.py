@@ -24,6 +24,7 @@ class UniformTargets:
     :param action_space: The actions; SB3 takes bounded ones only.
     :param interpolant: The interpolant of the update.
     :param latent_std: Standard deviation of the latents: a number, or one for each dimension.
+    :param device: Where the actions are.
     :raises ValueError: If the interpolant draws noise of its own, or actions have no bounds that
         mean something.
     """
@@ -33,6 +34,7 @@ class UniformTargets:
         action_space: spaces.Box,
         interpolant: Interpolant,
         latent_std: float | th.Tensor = 1.0,
+        device: th.device | str = "cpu",
     ) -> None:
         if interpolant.stochastic:
             raise ValueError(
@@ -46,14 +48,15 @@ class UniformTargets:
             )
         self._interpolant = interpolant
         self._latent_std = latent_std
-        self._low = th.as_tensor(action_space.low, device="cpu").flatten()
-        self._high = th.as_tensor(action_space.high, device="cpu").flatten()
+        self._low = th.as_tensor(action_space.low, device=device).flatten()
+        self._high = th.as_tensor(action_space.high, device=device).flatten()
 
     @classmethod
     def of(cls, policy: PolicyFlowPolicy) -> "UniformTargets":
         """The targets of a policy's flow."""
         assert isinstance(policy.action_space, spaces.Box)
-        return cls(policy.action_space, policy.flow.interpolant, policy.latent_scale)
+        interpolant, scale = policy.flow.interpolant, policy.latent_scale
+        return cls(policy.action_space, interpolant, scale, policy.device)
 
     def loss(self, velocity: VelocityField, features: th.Tensor) -> th.Tensor:
         """The mean squared error of the velocity.

@@ -12,10 +12,12 @@ from gymnasium.vector.utils import batch_space
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_policyflow import PolicyFlow
 from sb3_policyflow.envs.multigoal import MultiGoalVecEnv
+from sb3_policyflow.envs.tensor import TensorStep
 from sb3_policyflow.envs.vector import GymVectorVecEnv
 
 Options = Mapping[str, Any]
@@ -54,9 +56,36 @@ class NoiseEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return observations, np.zeros(self.num_envs), never, never, infos
 
 
+class NoiseTensorEnv:
+    """:class:`NoiseEnv` as a ``TensorVecEnv``.
+
+    :param num_envs: Number of environments.
+    :param obs_dim: Dimensions of an observation.
+    :param action_dim: Dimensions of an action.
+    :param device: Where the tensors are.
+    """
+
+    def __init__(self, num_envs: int, obs_dim: int, action_dim: int, device: str) -> None:
+        self.num_envs, self.device = num_envs, get_device(device)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
+        self.action_space = gym.spaces.Box(-1, 1, (action_dim,), np.float32)
+        self._rewards = th.zeros(num_envs, device=self.device)
+        self._never = self._rewards.bool()
+        self._ended = self._rewards[:0].long()
+
+    def reset(self) -> th.Tensor:
+        """Draw observations."""
+        return th.randn(self.num_envs, *self.observation_space.shape, device=self.device)
+
+    def step(self, actions: th.Tensor) -> TensorStep:  # noqa: ARG002
+        """Draw observations, for no reward and without an end."""
+        observations, never = self.reset(), self._never
+        return TensorStep(observations, self._rewards, never, never, self._ended, observations[:0])
+
+
 @dataclass(frozen=True)
 class Setting:
-    """Two ways to train, of which the first is compared with the second.
+    """Ways to train, which are compared with the last of them.
 
     :param title: What the table calls it.
     :param makers: Makes each model, by its name.
@@ -153,8 +182,11 @@ def action_dimension(action_dim: int) -> Setting:
 
 
 def isaaclab(embedding_dim: int, device: str) -> Setting:
-    """The paper's settings for IsaacLab's quadrupeds, without the simulator."""
-    return against_ppo(
+    """The paper's settings for IsaacLab's quadrupeds, without the simulator.
+
+    PolicyFlow with rollouts of tensors, and through arrays as PPO.
+    """
+    setting = against_ppo(
         f"4096 envs x 24, embedding {embedding_dim}",
         lambda: GymVectorVecEnv(NoiseEnv(4096, 48, 12)),
         {"n_steps": 24, "batch_size": 4096 * 24 // 4, "n_epochs": 5, "clip_range_vf": 0.2},
@@ -163,6 +195,16 @@ def isaaclab(embedding_dim: int, device: str) -> Setting:
         embedding_dim,
         device,
     )
+    arrays, ppo = setting.makers["PolicyFlow"], setting.makers["PPO"]
+
+    def tensors() -> OnPolicyAlgorithm:
+        model = arrays()
+        env: Any = NoiseTensorEnv(4096, 48, 12, device)
+        model.set_env(env)
+        return model
+
+    makers = {"PolicyFlow, tensors": tensors, "PolicyFlow, arrays": arrays, "PPO, arrays": ppo}
+    return Setting(setting.title, makers)
 
 
 MAIN: dict[str, Callable[[], Setting]] = {

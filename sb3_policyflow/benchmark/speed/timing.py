@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_policyflow.benchmark.speed.settings import Setting
+from sb3_policyflow.envs.tensor import TensorEnvAdapter
 
 PARTS = ("environment", "sampling", "bootstrap", "other", "update")
 """What an iteration consists of: ``other`` is the rest of a rollout, buffer and loop."""
@@ -29,7 +30,10 @@ class Stopwatch:
         assert model.env is not None
         self._model = model
         self._total: Seconds = {}
-        self._watch(model.env, "step_wait", "environment")
+        if isinstance(model.env, TensorEnvAdapter):
+            self._watch(model.env.env, "step", "environment")
+        else:
+            self._watch(model.env, "step_wait", "environment")
         self._watch(model.policy, "forward", "sampling")
         self._watch(model.policy, "predict_values", "bootstrap")
         self._watch(model, "train", "update")
@@ -67,7 +71,8 @@ def now(model: OnPolicyAlgorithm) -> float:
 def time_setting(setting: Setting, repetitions: int) -> dict[str, Any]:
     """Train all of a setting's models in turn; medians, ratios, and all measurements.
 
-    The first iteration of each, which compiles and allocates, does not count.
+    Ratios are those of the first to the last. The first iteration of each, which compiles and
+    allocates, does not count.
     """
     watches = {name: Stopwatch(make()) for name, make in setting.makers.items()}
     for watch in watches.values():
@@ -78,12 +83,12 @@ def time_setting(setting: Setting, repetitions: int) -> dict[str, Any]:
         for name in names if repetition % 2 == 0 else reversed(names):
             taken[name].append(watches[name].iteration())
     medians = {name: _medians(runs) for name, runs in taken.items()}
-    first, second = ([run["total"] for run in runs] for runs in taken.values())
+    first, *_, last = ([run["total"] for run in runs] for runs in taken.values())
     return {
         "title": setting.title,
         "seconds": medians,
-        "ratio": statistics.median(first) / statistics.median(second),
-        "ratios": [a / b for a, b in zip(first, second, strict=True)],
+        "ratio": statistics.median(first) / statistics.median(last),
+        "ratios": [a / b for a, b in zip(first, last, strict=True)],
         "runs": taken,
     }
 

@@ -86,11 +86,13 @@ def growth_figures(repetitions: int) -> dict[str, list[dict[str, Any]]]:
 
 
 def iterations_table(results: Sequence[dict[str, Any]]) -> str:
-    """A row for each model: its median time, what it goes to, and the ratio."""
+    """A row for each model: its median time, what it goes to, and the ratio to the last model."""
     rows = []
     for result in results:
-        for place, (name, seconds) in enumerate(result["seconds"].items()):
-            ratio = f"**{result['ratio']:.2f}**" if place == 0 else ""
+        *_, last = result["seconds"]
+        reference = result["seconds"][last]["total"]
+        for name, seconds in result["seconds"].items():
+            ratio = "" if name == last else f"**{seconds['total'] / reference:.2f}**"
             times = [f"{1000 * seconds[part]:.0f}" for part in ("total", *PARTS)]
             rows.append([result["title"], name, ratio, *times])
     return markdown_table(["", "", "ratio", "iteration, ms", *PARTS], rows)
