@@ -33,6 +33,7 @@ class GraphMemory:
         self.is_warm = False
         """Whether the libraries that a graph calls have been called before, as they must be."""
         self._last: th.cuda.CUDAGraph | None = None
+        self._stream: Any = None  # one for all, as libraries keep memory for each that they see
 
     def __reduce__(self) -> Any:
         return type(self), ()
@@ -45,8 +46,10 @@ class GraphMemory:
         :return: The graph, and what the function returned. Tensors in it are the graph's: they have
             values after each replay.
         """
-        make_stream: Any = th.cuda.Stream
-        graph, stream = th.cuda.CUDAGraph(), make_stream()
+        if self._stream is None:
+            make_stream: Any = th.cuda.Stream
+            self._stream = make_stream()
+        graph, stream = th.cuda.CUDAGraph(), self._stream
         stream.wait_stream(th.cuda.current_stream())
         pool = None if self._last is None else self._last.pool()
         with th.cuda.stream(stream), _without_garbage_collection():
@@ -77,11 +80,17 @@ class _Replay:
 
     :param function: The function, see :meth:`GraphMemory.record`.
     :param inputs: Tensors like those that it will be given.
+    :param memory: That of others which are replayed on the same stream.
     """
 
-    def __init__(self, function: Callable[..., th.Tensor], inputs: Sequence[th.Tensor]) -> None:
+    def __init__(
+        self,
+        function: Callable[..., th.Tensor],
+        inputs: Sequence[th.Tensor],
+        memory: GraphMemory,
+    ) -> None:
         self._inputs = [tensor.clone() for tensor in inputs]
-        self._graph, self._output = GraphMemory().record(lambda: function(*self._inputs))
+        self._graph, self._output = memory.record(lambda: function(*self._inputs))
 
     def __call__(self, inputs: Sequence[th.Tensor]) -> th.Tensor:
         th._foreach_copy_(self._inputs, list(inputs))
@@ -103,6 +112,7 @@ class FlowGraphs:
         self._view: KernelView[Any] = KernelView(read, "cuda")
         self._parts: object = None
         self._replays: dict[Any, _Replay | None] = {}
+        self._memories: dict[Any, GraphMemory] = {}
         self._lock = Lock()
 
     def __reduce__(self) -> Any:
@@ -141,7 +151,7 @@ class FlowGraphs:
             return None
         shapes = latents.shape, features.shape
         place = latents.device, th.cuda.current_stream(latents.device).cuda_stream
-        key = (*method, *shapes, *place, th.get_float32_matmul_precision())
+        key = (*method, *shapes, place, th.get_float32_matmul_precision())
         with self._lock, th.cuda.device(latents.device):
             if parts is not self._parts or len(self._replays) >= MAX_GRAPHS:
                 self._parts, self._replays = parts, {}
@@ -150,7 +160,8 @@ class FlowGraphs:
                 return None
             replay = self._replays[key]
             if replay is None:
-                replay = self._replays[key] = _Replay(integrate, inputs)
+                memory = self._memories.setdefault(place, GraphMemory())
+                replay = self._replays[key] = _Replay(integrate, inputs, memory)
             return replay(inputs)
 
 

@@ -270,25 +270,30 @@ def test_what_is_recorded_is_the_update(
 
 
 @needs_gpu
-def test_random_numbers_in_the_loss() -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "option", "metric"),
+    [
+        (PolicyFlow, {"uniform_noise_coef": 1.0}, "uniform_noise_loss"),
+        (FPO, {"ent_coef": 0.1}, "entropy_loss"),
+    ],
+    ids=["policyflow", "fpo"],
+)
+def test_random_numbers_in_the_loss(
+    algorithm: Any, option: dict[str, Any], metric: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each replay draws others."""
+    drawn, call = [], LossGraph.__call__
+
+    def watched(graph: LossGraph, batch: Any) -> Any:
+        terms = call(graph, batch)
+        drawn.append(float(terms.means[metric]))
+        return terms
+
+    monkeypatch.setattr(LossGraph, "__call__", watched)
     env = MultiGoalTensorEnv(64, seed=0, device="cuda")
-    for algorithm, options in ((PolicyFlow, {"uniform_noise_coef": 1.0}), (FPO, {"ent_coef": 0.1})):
-        options = {**OPTIONS, "n_epochs": 4, "learning_rate": 1e-12, **options}
-        model: Any = algorithm("MlpPolicy", env, device="cuda", **options)
-        model.learn(2 * 8 * 64)
-        drawn: list[float] = []
-        add_means = algorithm_module.UpdateMetrics.add_means
-
-        def watched(metrics: Any, values: Any) -> None:
-            name = "uniform_noise_loss" if algorithm is PolicyFlow else "entropy_loss"  # noqa: B023
-            drawn.extend([float(values[name])] if name in values else [])  # noqa: B023
-            add_means(metrics, values)  # noqa: B023
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(algorithm_module.UpdateMetrics, "add_means", watched)
-            model.learn(8 * 64, reset_num_timesteps=False)
-        assert len(set(drawn)) == len(drawn) > 8
+    options = {**OPTIONS, "n_epochs": 4, "learning_rate": 1e-12, **option}
+    algorithm("MlpPolicy", env, device="cuda", **options).learn(3 * 8 * 64)
+    assert len(set(drawn)) == len(drawn) == 3 * 4 * 4
 
 
 @needs_gpu
