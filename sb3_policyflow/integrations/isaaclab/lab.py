@@ -11,8 +11,11 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_policyflow.envs.tensor import TensorEnvAdapter
 from sb3_policyflow.integrations.isaaclab.presets import AGENT_KEY, TASKS, register_presets
+from sb3_policyflow.integrations.isaaclab.tensors import GROUP, IsaacLabTensorEnv, are_vectors
 
 Launched = AbstractContextManager["Configured"]
 
@@ -151,22 +154,34 @@ def _nearest(task: str) -> str:
     return f": did you mean {' or '.join(near)}?" if near else ""
 
 
-def wrap(env: Any, bounds: tuple[float, float]) -> Any:
-    """IsaacLab's environment as an SB3 ``VecEnv``.
+def wrap(env: Any, bounds: tuple[float, float]) -> VecEnv:
+    """IsaacLab's environment as an SB3 ``VecEnv``, whose steps remain tensors.
+
+    :param env: What ``gymnasium.make`` returned.
+    :param bounds: Bounds for actions that have none.
+    :raises LabError: If observations are images, and IsaacLab's wrapper cannot have these bounds.
+    """
+    if are_vectors(env.unwrapped.single_observation_space[GROUP]):
+        return TensorEnvAdapter(IsaacLabTensorEnv(env, bounds))
+    return wrap_for_arrays(env, bounds)
+
+
+def wrap_for_arrays(env: Any, bounds: tuple[float, float]) -> VecEnv:
+    """IsaacLab's environment in its own wrapper for SB3, which returns arrays.
 
     :param env: What ``gymnasium.make`` returned.
     :param bounds: Bounds for actions that have none. Version 2 has -100 and 100 only.
     :raises LabError: If these are other bounds, and it is version 2.
     """
-    wrapper = importlib.import_module("isaaclab_rl.sb3").Sb3VecEnvWrapper
-    if "action_bounds" in inspect.signature(wrapper).parameters:
-        return wrapper(env, action_bounds=bounds)
+    make: Callable[..., VecEnv] = importlib.import_module("isaaclab_rl.sb3").Sb3VecEnvWrapper
+    if "action_bounds" in inspect.signature(make).parameters:
+        return make(env, action_bounds=bounds)
     if bounds != (-100.0, 100.0):
         raise LabError(
             f"This version of IsaacLab bounds actions by -100 and 100, not by {bounds[0]:g} and "
             f"{bounds[1]:g}: leave out --action_bounds."
         )
-    return wrapper(env)
+    return make(env)
 
 
 def prepare_timeouts(env_config: Any, timeout_bootstrap: str) -> None:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_policyflow.device.environments import tensors_behind
 from sb3_policyflow.distributed.ranks import current
 from sb3_policyflow.integrations.isaaclab.checkpoint import Checkpoint, read_checkpoint
 from sb3_policyflow.integrations.isaaclab.lab import (
@@ -173,16 +174,27 @@ def train(
     """
     moment = time.strftime("%Y-%m-%d_%H-%M-%S")
     folder = options.log_dir or Path("logs", "sb3_policyflow", options.task, moment)
+    # Tensors of the simulator stay where it is, and so does the model.
+    tensors = tensors_behind(env)
+    device: Any = "auto" if tensors is None else tensors[0].env.device
     env = normalized(env, normalization, agent.get("gamma", 0.99), options.checkpoint)
     if options.checkpoint is None:
         model = PolicyFlow(
-            agent.pop("policy"), env, verbose=1, tensorboard_log=str(folder), **agent
+            agent.pop("policy"),
+            env,
+            verbose=1,
+            tensorboard_log=str(folder),
+            **{"device": device, **agent},
         )
     else:
         # A seed restarts the random generators; without one they continue.
         seed = {} if options.seed is None else {"seed": options.seed}
         model = PolicyFlow.load(
-            options.checkpoint.path, env=env, tensorboard_log=str(folder), **seed
+            options.checkpoint.path,
+            env=env,
+            device=device,
+            tensorboard_log=str(folder),
+            **seed,
         )
     callback = RolloutCheckpointCallback(
         options.save_interval * model.n_steps,

@@ -38,10 +38,16 @@ def assert_refused(arguments: list[str], *parts: str) -> None:
 
 
 def wrapped(n_envs: int = 4, final: bool = False, **options: Any) -> Any:
-    """The fake environment in the wrapper of version 3, as the script wraps it."""
-    tasks = importlib.import_module("isaaclab_tasks")
-    config = tasks.EnvConfig()
+    """The fake environment in the wrapper of version 3."""
+    bounds = options.get("bounds", (-100.0, 100.0))
+    return lab.wrap_for_arrays(make_env(n_envs, final), bounds)
+
+
+def make_env(n_envs: int = 4, final: bool = False, version: str = "three") -> Any:
+    """The fake environment."""
+    importlib.import_module("isaaclab_tasks")
+    fakes = importlib.import_module("isaaclab_tasks" if version == "three" else "fake_lab")
+    config = fakes.EnvConfig()
     config.scene.num_envs = n_envs
     lab.prepare_timeouts(config, "terminal" if final else "current")
-    env = gym.make(TASKS["three"], cfg=config)
-    return lab.wrap(env, options.get("bounds", (-100.0, 100.0)))
+    return gym.make(TASKS[version], cfg=config)

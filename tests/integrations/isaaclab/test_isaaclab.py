@@ -103,11 +103,6 @@ def test_an_isaaclab_that_lacks_something_shows_what() -> None:
         ("two", ["--task", TASKS["two"], "--agent", "sb3"], ["'sb3', but rsl_rl_cfg_entry_point"]),
         (
             "two",
-            ["--task", TASKS["two"], "--action_bounds", "-1", "1"],
-            ["by -100 and 100, not by -1 and 1"],
-        ),
-        (
-            "two",
             ["--task", TASKS["two"], "agent.timeout_bootstrap=terminal"],
             ["does not return the last observation", "agent.timeout_bootstrap=current"],
         ),

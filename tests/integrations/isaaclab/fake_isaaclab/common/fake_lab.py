@@ -49,6 +49,9 @@ class LabEnv(gym.Env[Any, Any]):
         self.single_observation_space = {"policy": spaces.Box(-np.inf, np.inf, (3,))}
         self.single_action_space = spaces.Box(-np.inf, np.inf, (2,))
         self.generator = th.Generator()
+        # Written to in each step, as those of the real one are.
+        self.rewards = th.zeros(self.num_envs)
+        self.terminated, self.truncated = th.zeros(2, self.num_envs, dtype=th.bool)
 
     def seed(self, seed: int | None = None) -> int | None:
         if seed is not None:
@@ -71,13 +74,14 @@ class LabEnv(gym.Env[Any, Any]):
         self.position = self.position + 0.3 * action
         self.time = self.time + 1
         distance = self.position.norm(dim=1)
-        terminated, truncated = distance > 4, self.time >= LIMIT
-        over = terminated | truncated
+        self.terminated[:], self.truncated[:] = distance > 4, self.time >= LIMIT
+        self.rewards[:] = -distance
+        over = self.terminated | self.truncated
         extras: dict[str, Any] = {"log": {"reached": distance.mean()}}
         if over.any() and getattr(self.cfg, "compute_final_obs", False):
             extras["final_obs"] = self.observe()
         self.position[over], self.time[over] = self.begin(int(over.sum()))
-        return self.observe(), -distance, terminated, truncated, extras
+        return self.observe(), self.rewards, self.terminated, self.truncated, extras
 
     def close(self) -> None:
         print("environment closed")  # noqa: T201  # the tests look for it
