@@ -21,7 +21,6 @@ from sb3_policyflow.common.minibatches import (
 from sb3_policyflow.common.optimization import (
     check_step,
     clip_gradients,
-    critic_apart,
     take_step,
 )
 from sb3_policyflow.common.policies import FlowPolicy
@@ -267,7 +266,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
                 kls.append(kl)
                 stop = self.target_kl is not None and self.ranks.mean(kl) > 1.5 * self.target_kl
                 if not stop:
-                    self._optimize(loss, parameters, update.trains_actor)  # lines 22 and 23
+                    self._optimize(loss, parameters, update)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
                     adapt_learning_rate(self, rule, kls[-1:], update.trains_actor)
                 if stop:
@@ -294,28 +293,20 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             minibatches.map_advantages(self.ranks.normalized)
         return minibatches
 
-    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], trains_actor: bool) -> None:
+    def _optimize(self, loss: Loss, parameters: list[th.nn.Parameter], update: FlowUpdate) -> None:
         """Take one step of the optimizer.
 
         :raises FloatingPointError: If loss or gradient are not finite; parameters do not change.
         """
         for parameter in parameters:
             parameter.grad = None
-        trained = None if trains_actor else list(self.policy.critic_parameters())
+        trained = None if update.trains_actor else list(self.policy.critic_parameters())
         loss.backward(inputs=trained)
         mean_loss = self.ranks.average_gradients(parameters, loss.item())
         norm = clip_gradients(parameters, self.max_grad_norm)
         check_step(mean_loss, norm, self.num_timesteps, self.divergence_advice)
-        self._take_step(self.policy.optimizer)
+        take_step(self.policy.optimizer, update.critic_rate)
         self.policy.keep_within_bounds()
-
-    def _take_step(self, optimizer: th.optim.Optimizer) -> None:
-        if self.critic_learning_rate is None:
-            take_step(optimizer)
-            return
-        rate = self.value_of("critic_learning_rate")
-        with critic_apart(optimizer, self.policy.critic_parameters(), rate):
-            take_step(optimizer)
 
     def _log_update(self, loss: Loss, approx_kl: th.Tensor, metrics: UpdateMetrics) -> None:
         """Log what the update did, and count its rollout."""

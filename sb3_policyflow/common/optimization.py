@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, nullcontext
+from typing import Any, NamedTuple
 
 import torch as th
 
@@ -58,38 +58,44 @@ def clip_gradients(parameters: Iterable[th.nn.Parameter], max_norm: float | None
     return norm
 
 
-@contextmanager
-def critic_apart(
-    optimizer: th.optim.Optimizer, critic: Iterable[th.nn.Parameter], learning_rate: float
-) -> Iterator[None]:
-    """A block in which the critic's parameters have a learning rate of their own.
+class OwnRate(NamedTuple):
+    """A learning rate of their own for some of an optimizer's parameters."""
 
-    They are a group of the optimizer for no longer, so that its state is laid out as ever.
+    parameters: frozenset[th.nn.Parameter]
+    learning_rate: float
+
+
+def take_step(optimizer: th.optim.Optimizer, own_rate: OwnRate | None = None) -> None:
+    """Take a step of an optimizer, in one call of a kernel if it is plain Adam on a CPU.
 
     :param optimizer: The optimizer.
-    :param critic: The critic's parameters.
-    :param learning_rate: Theirs.
+    :param own_rate: For those of its parameters that have a learning rate of their own.
     """
-    groups, critic = optimizer.param_groups, set(critic)
+    with nullcontext() if own_rate is None else _apart(optimizer, own_rate):
+        if not step_in_place(optimizer):
+            optimizer.step()
+
+
+@contextmanager
+def _apart(optimizer: th.optim.Optimizer, own_rate: OwnRate) -> Iterator[None]:
+    """A block in which parameters with a rate of their own are a group of the optimizer.
+
+    They are no longer than that, so that its state is laid out as ever.
+    """
+    groups = optimizer.param_groups
     optimizer.param_groups = []
     for group in groups:
-        own = [parameter for parameter in group["params"] if parameter in critic]
-        others = [parameter for parameter in group["params"] if parameter not in critic]
+        own = [parameter for parameter in group["params"] if parameter in own_rate.parameters]
+        others = [p for p in group["params"] if p not in own_rate.parameters]
         optimizer.param_groups += [
             {**group, "params": parameters, "lr": rate}
-            for parameters, rate in ((others, group["lr"]), (own, learning_rate))
+            for parameters, rate in ((others, group["lr"]), (own, own_rate.learning_rate))
             if parameters
         ]
     try:
         yield
     finally:
         optimizer.param_groups = groups
-
-
-def take_step(optimizer: th.optim.Optimizer) -> None:
-    """Take a step of an optimizer, in one call of a kernel if it is plain Adam on a CPU."""
-    if not step_in_place(optimizer):
-        optimizer.step()
 
 
 def check_step(loss: float, norm: float, num_timesteps: int, advice: str) -> None:

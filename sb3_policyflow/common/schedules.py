@@ -90,7 +90,7 @@ class KLAdaptiveLearningRate:
 
     :param interval: When the learning rate moves: after each "epoch" or "minibatch".
     :param window: Whether the divergence at the end of an epoch is the mean over this "epoch" or
-        over the "update" so far.
+        over the "update" so far. It has no meaning if the rate moves after each minibatch.
     :param factor: Factor by which the learning rate moves, greater than 1.
     :param margin: Factor by which the divergence may miss the target before the rate moves.
     :param bounds: Lowest and highest learning rate. A start outside the bounds is kept and may only

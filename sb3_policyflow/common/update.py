@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_policyflow.common.losses import SURROGATES, ImitationPull, clipped_value_loss
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples, Minibatches
+from sb3_policyflow.common.optimization import OwnRate
 from sb3_policyflow.common.schedules import is_zero
 from sb3_policyflow.kernels import has_fixed_features
 
@@ -99,6 +100,10 @@ class FlowUpdate(ABC):
         self.log_ratio_clamp: float | None = None
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
+        self.critic_rate: OwnRate | None = None
+        if algorithm.critic_learning_rate is not None:
+            critic = frozenset(self.policy.critic_parameters())
+            self.critic_rate = OwnRate(critic, algorithm.value_of("critic_learning_rate"))
         self.pull: ImitationPull | None = None
         if (coef := algorithm.value_of("imitation_coef")) > 0:
             self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)
