@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch as th
@@ -152,7 +153,7 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         own = [option.name for option in own_options(type(self)) if hasattr(self, option.name)]
         return {**data, **{name: getattr(self, name) for name in (*self.shared_options, *own)}}
 
-    @property
+    @cached_property
     def action_dim(self) -> int:
         """Number of action dimensions, whatever the shape of the Box."""
         return get_action_dim(self.action_space)
