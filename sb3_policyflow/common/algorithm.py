@@ -252,7 +252,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         rollout = self._rollout()
         self.policy.set_training_mode(False)
         update = self.update_class(self, rollout)  # line 3: remembers the reference policy
-        record_losses(update)
+        record_losses(self, update)
         parameters = list(self.policy.parameters())
         rule = KLAdaptiveLearningRate(**(self.lr_adaptation_kwargs or {}))
         metrics, kls = UpdateMetrics(), list[th.Tensor]()

@@ -101,9 +101,12 @@ def penalized_surrogate(
     """
     ratio = log_ratio.exp()
     # A schedule may end at 0, where the old policy alone is allowed.
-    width = th.as_tensor(clip_range, dtype=log_ratio.dtype, device=log_ratio.device)
-    width = width.clamp_min(SMALLEST_CLIP_RANGE)
-    return ratio * advantages - advantages.abs() / (2 * width) * (ratio - 1) ** 2
+    if isinstance(clip_range, th.Tensor):
+        width: th.Tensor | float = clip_range.clamp_min(SMALLEST_CLIP_RANGE)
+    else:
+        width = max(clip_range, SMALLEST_CLIP_RANGE)
+    penalty: th.Tensor = advantages.abs() / (2 * width) * (ratio - 1) ** 2
+    return ratio * advantages - penalty
 
 
 def asymmetric_surrogate(

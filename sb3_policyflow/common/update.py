@@ -42,7 +42,7 @@ class Loss(Protocol):
         """Add its gradients to those of the parameters; of ``inputs`` only, if they are given."""
 
 
-class CompiledTerms(NamedTuple):
+class EvaluatedTerms(NamedTuple):
     """A minibatch's loss and divergence, see :class:`PolicyTerms`, and what is to be logged.
 
     Means over the minibatches are logged of ``means``, and the greatest of ``maxima``.
@@ -54,7 +54,7 @@ class CompiledTerms(NamedTuple):
     maxima: Metrics
 
 
-EvaluateRows = Callable[[slice], CompiledTerms | None]
+EvaluateRows = Callable[[slice], EvaluatedTerms | None]
 """Evaluates the loss of some of the samples that were prepared; None if it no longer can."""
 CompiledLoss = Callable[[FlowRolloutBufferSamples, th.Tensor, th.Tensor], EvaluateRows | None]
 """Takes samples, and the features of actor and critic; None where kernels cannot work."""
@@ -73,18 +73,18 @@ class FlowUpdate(ABC):
     ``compiled_loss``, it takes the place of :meth:`loss` where it can, and so does a
     ``recorded_loss``, a graph of it on a GPU. An algorithm whose formulas start the same operations
     for every minibatch, and wait for none, says so as ``class MyUpdate(FlowUpdate,
-    has_known_formulas=True)``.
+    may_be_recorded=True)``.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.
     :param rollout: The whole rollout of n samples.
     """
 
-    has_known_formulas: ClassVar[bool] = False
+    may_be_recorded: ClassVar[bool] = False
     """Whether :meth:`loss` may be recorded; a subclass may have any, and must say it itself."""
 
-    def __init_subclass__(cls, has_known_formulas: bool = False) -> None:
+    def __init_subclass__(cls, may_be_recorded: bool = False) -> None:
         super().__init_subclass__()
-        cls.has_known_formulas = has_known_formulas
+        cls.may_be_recorded = may_be_recorded
 
     def __init__(self, algorithm: Any, rollout: FlowRolloutBufferSamples) -> None:
         self.rollout = rollout
@@ -93,7 +93,7 @@ class FlowUpdate(ABC):
         bounds_values = algorithm.clip_range_vf is not None
         self.clip_range_vf = algorithm.value_of("clip_range_vf") if bounds_values else None
         self.compiled_loss: CompiledLoss | None = None
-        self.recorded_loss: Callable[[FlowRolloutBufferSamples], CompiledTerms] | None = None
+        self.recorded_loss: Callable[[FlowRolloutBufferSamples], EvaluatedTerms] | None = None
         self.batch_size: int = algorithm.ranks.share("batch_size", algorithm.batch_size)
         self.trust_region: str = algorithm.trust_region
         self.clip_range: float | th.Tensor = algorithm.value_of("clip_range")
@@ -157,7 +157,7 @@ class FlowUpdate(ABC):
         return self.compiled_loss(samples, features, critic_features)
 
     @staticmethod
-    def _logged(compiled: CompiledTerms, metrics: "UpdateMetrics") -> tuple[Loss, th.Tensor]:
+    def _logged(compiled: EvaluatedTerms, metrics: "UpdateMetrics") -> tuple[Loss, th.Tensor]:
         metrics.add_means(compiled.means)
         metrics.add_maxima(compiled.maxima)
         return compiled.loss, compiled.kl

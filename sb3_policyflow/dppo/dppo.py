@@ -28,7 +28,7 @@ from sb3_policyflow.dppo.policies import (
 )
 
 
-class DPPOUpdate(FlowUpdate, has_known_formulas=True):
+class DPPOUpdate(FlowUpdate, may_be_recorded=True):
     """DPPO's part of the update of one rollout, whose record has the reference policy's means.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.

@@ -5,7 +5,7 @@ from typing import NamedTuple, TypedDict
 import torch as th
 
 from sb3_policyflow.flows.interpolants import Interpolant
-from sb3_policyflow.flows.solvers import SOLVERS, solver_times
+from sb3_policyflow.flows.solvers import SOLVERS, solver_times_like
 from sb3_policyflow.flows.velocity import VelocityField
 
 
@@ -67,8 +67,7 @@ class Flow(NamedTuple):
     def times(self) -> th.Tensor:
         """The solver's time grid on the device of the field (paper: the discrete time grid)."""
         like = self.velocity.time_embedding.frequencies
-        end_time = self.interpolant.end_time
-        return solver_times(self.solver, self.n_steps, end_time, like.device).to(like.dtype)
+        return solver_times_like(like, self.solver, self.n_steps, self.interpolant.end_time)
 
     @property
     def n_evaluations(self) -> int:

@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn.modules import module as torch_module
 
 from sb3_policyflow.flows.choices import choose
-from sb3_policyflow.flows.solvers import SOLVERS, solver_times
+from sb3_policyflow.flows.solvers import SOLVERS, solver_times_like
 
 if TYPE_CHECKING:  # that module imports this one
     from sb3_policyflow.flows.velocity import VelocityField
@@ -123,7 +123,7 @@ def integrate_folded(
     :param end_time: T, where the flow ends.
     :return: phi, of the shape of ``latents``.
     """
-    times = solver_times(solver, n_steps, end_time, latents.device).to(latents.dtype)
+    times = solver_times_like(latents, solver, n_steps, end_time)
     first = fold(field, times)
     shift = features @ first.features.T
     rest = nn.Sequential(*field.layers[1:])

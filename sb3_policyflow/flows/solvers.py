@@ -158,9 +158,7 @@ SOLVERS: dict[str, Solver] = {
 }
 
 
-def solver_times(
-    solver: str, n_steps: int, end_time: float = 1.0, device: th.device | str = "cpu"
-) -> th.Tensor:
+def solver_times(solver: str, n_steps: int, end_time: float = 1.0) -> th.Tensor:
     """Every time at which a solver looks, end points included (paper: the discrete time grid).
 
     >>> solver_times("midpoint", 2).tolist()
@@ -169,10 +167,27 @@ def solver_times(
     :param solver: Name of the solver.
     :param n_steps: Number of equal steps, at least 1.
     :param end_time: Where the integration ends.
-    :param device: Where the times are made.
     :return: Times in increasing order, float64, shape (n_steps * grid_points_per_step + 1,).
     :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
     """
+    return _times(solver, n_steps, end_time, "cpu")
+
+
+def solver_times_like(
+    tensor: th.Tensor, solver: str, n_steps: int, end_time: float = 1.0
+) -> th.Tensor:
+    """What :func:`solver_times` returns, on the device and of the dtype of a tensor.
+
+    A GPU of NVIDIA's makes them itself: CUDA graphs record no copies from the host. Other devices
+    may have no float64.
+
+    :param tensor: Says where, and of which dtype.
+    """
+    place = tensor.device if tensor.is_cuda else "cpu"
+    return _times(solver, n_steps, end_time, place).to(tensor)
+
+
+def _times(solver: str, n_steps: int, end_time: float, device: th.device | str) -> th.Tensor:
     if n_steps < 1:
         raise ValueError(f"A flow needs at least one solver step, got n_flow_steps={n_steps}.")
     n_parts = choose("solver", solver, SOLVERS).grid_points_per_step * n_steps
@@ -203,5 +218,5 @@ def integrate(
     :return: phi, the end points, of the shape of ``latents``.
     :raises ValueError: If the solver is unknown or ``n_steps`` is less than 1.
     """
-    times = solver_times(solver, n_steps, end_time, latents.device).to(latents.dtype)
+    times = solver_times_like(latents, solver, n_steps, end_time)
     return SOLVERS[solver].solve(velocity, latents, times)

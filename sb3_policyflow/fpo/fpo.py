@@ -38,7 +38,7 @@ class MonteCarloSamples(NamedTuple):
     reference_losses: th.Tensor
 
 
-class FPOUpdate(FlowUpdate, has_known_formulas=True):
+class FPOUpdate(FlowUpdate, may_be_recorded=True):
     """FPO's part of the update of one rollout.
 
     Times and noises are drawn here and not when acting. They are the same in distribution, because

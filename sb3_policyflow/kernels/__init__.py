@@ -13,7 +13,7 @@ from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels.critic import KernelCritic
 from sb3_policyflow.kernels.fields import KernelVelocityField
 from sb3_policyflow.kernels.gradients import clip_gradients_in_place, step_in_place
-from sb3_policyflow.kernels.graphs import GraphMemory
+from sb3_policyflow.kernels.graphs import GraphMemory, Recording
 from sb3_policyflow.kernels.inspection import are_in_mode, are_usable, has_values
 from sb3_policyflow.kernels.layouts import LossOptions
 from sb3_policyflow.kernels.losses import EvaluatedLoss, KernelLoss, LossInputs
@@ -32,6 +32,7 @@ __all__ = [
     "KernelLoss",
     "LossInputs",
     "LossOptions",
+    "Recording",
     "are_in_mode",
     "are_usable",
     "clip_gradients_in_place",

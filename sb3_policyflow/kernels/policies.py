@@ -57,16 +57,20 @@ def reason_graphs_are_off(policy: Any) -> str | None:
     critic = KernelView(read_critic, "cuda").of(policy)
     if isinstance(critic, str):
         return f"for the critic, {critic}"
+    if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in policy.parameters()):
+        return "parameters have hooks"
     extractors = policy.pi_features_extractor, policy.vf_features_extractor
     return next(filter(None, map(_why_unknown, extractors)), None)
 
 
 def _why_unknown(extractor: Any) -> str | None:
     """Why it is not known what a features extractor does."""
-    if type(extractor) not in EXTRACTORS:
-        return f"{type(extractor).__name__} is a features extractor of your own"
-    if any(map(has_hooks, extractor.modules())):
-        return f"{type(extractor).__name__} has hooks"
+    for module in extractor.modules():
+        name = type(module).__name__
+        if type(module) not in EXTRACTORS and not type(module).__module__.startswith("torch.nn."):
+            return f"{name} is a features extractor of your own"
+        if has_hooks(module):
+            return f"{name} has hooks"
     return None
 
 

@@ -8,7 +8,7 @@ import torch as th
 from sb3_policyflow.common.losses import SURROGATES, clipped_surrogate
 from sb3_policyflow.common.minibatches import FlowRolloutBufferSamples
 from sb3_policyflow.common.policies import FlowPolicy
-from sb3_policyflow.common.update import CompiledLoss, CompiledTerms, EvaluateRows
+from sb3_policyflow.common.update import CompiledLoss, EvaluatedTerms, EvaluateRows
 from sb3_policyflow.flows import Interpolant
 from sb3_policyflow.kernels import EvaluatedLoss, KernelLoss, LossInputs, LossOptions, are_usable
 
@@ -79,7 +79,7 @@ class CompiledPolicyFlowLoss:
         return None if prepared is None else lambda rows: _terms(prepared.evaluate(rows))
 
 
-def _terms(evaluated: EvaluatedLoss | None) -> CompiledTerms | None:
+def _terms(evaluated: EvaluatedLoss | None) -> EvaluatedTerms | None:
     """A minibatch's loss by its parts."""
     if evaluated is None:
         return None
@@ -87,4 +87,4 @@ def _terms(evaluated: EvaluatedLoss | None) -> CompiledTerms | None:
     kl = th.tensor(means.pop("kl"), dtype=th.float32, device="cpu")
     maxima = {"log_ratio_max": means.pop("log_ratio_max")}
     means["entropy_loss"] = -means.pop("entropy")
-    return CompiledTerms(evaluated, kl, means, maxima)
+    return EvaluatedTerms(evaluated, kl, means, maxima)

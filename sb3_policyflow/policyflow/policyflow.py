@@ -46,7 +46,7 @@ class PathSamples(NamedTuple):
     reference_velocity: th.Tensor
 
 
-class PolicyFlowUpdate(FlowUpdate, has_known_formulas=True):
+class PolicyFlowUpdate(FlowUpdate, may_be_recorded=True):
     """Algorithm 1 for one rollout: line 3, and in each epoch lines 15 to 18, 20 and 21.
 
     :param algorithm: The algorithm, whose policy has not been updated yet.

@@ -1,10 +1,13 @@
 """CUDA graphs compute what the operations that they record compute, to the last bit."""
 
 import copy
+import gc
 import pickle
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from torch import nn
 
 from sb3_policyflow import DPPO, FPO, PolicyFlow
 from sb3_policyflow.common import algorithm as algorithm_module
+from sb3_policyflow.common import graphs as graphs_module
 from sb3_policyflow.common.graphs import LossGraph
 from sb3_policyflow.common.update import FlowUpdate
 from sb3_policyflow.envs.multigoal import MultiGoalTensorEnv
@@ -22,6 +26,7 @@ from sb3_policyflow.envs.tensor import TensorStep
 from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels import (
     GraphMemory,
+    Recording,
     make_velocity_field,
     reason_graphs_are_off,
     reason_training_is_slow,
@@ -190,7 +195,11 @@ VARIANTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
     "several_times": (PolicyFlow, {"n_times": 2, "clip_range": "lin_0.2", "clip_range_vf": 0.2}),
     "critic_first": (PolicyFlow, {"n_critic_warmup": 2, "max_grad_norm": 0.1}),
     "unequal": (PolicyFlow, {"batch_size": 100}),
+    "trigflow": (PolicyFlow, {"interpolant": "trigflow", "solver": "ab2"}),
+    "stochastic": (PolicyFlow, {"interpolant": "stochastic_exact", "brownian_coef": 0.1}),
     "fpo": (FPO, {"n_mc_samples": 4}),
+    "aspo": (FPO, {"trust_region": "aspo", "mc_average": "objective"}),
+    "spo": (FPO, {"trust_region": "spo"}),
     "dppo": (DPPO, {"target_kl": 1.0}),
     "dppo_last": (DPPO, {"n_finetuned_steps": 3, "clip_range_base": 0.01}),
 }
@@ -211,7 +220,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
     def watched(graph: LossGraph, batch: Any) -> Any:
         terms = call(graph, batch)
-        calls.append(graph._graph is not None)
+        calls.append(graph._recording is not None)
         return terms
 
     monkeypatch.setattr(LossGraph, "__call__", watched)
@@ -226,7 +235,7 @@ def test_training_is_the_same(
     model = trained(name)
     assert sum(recorded) >= len(recorded) - 1 > 0  # the first ever is not recorded
     logged = dict(model.logger.name_to_value)
-    monkeypatch.setattr(algorithm_module, "record_losses", lambda _: None)
+    monkeypatch.setattr(algorithm_module, "record_losses", lambda *_: None)
     recorded.clear()
     plain = trained(name)
     assert not recorded
@@ -237,36 +246,121 @@ def test_training_is_the_same(
         assert logged[key] == pytest.approx(plain.logger.name_to_value[key], rel=1e-6), key
 
 
-class NeverWarm(GraphMemory):
-    """Memory for graphs that are never recorded."""
+class Rerun(Recording[Any]):
+    """Stands for a graph where there is no GPU: writes to the same tensors in each replay."""
 
-    is_warm = property(lambda _: False, lambda *_: None)  # type: ignore[assignment]
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self.function, self.result, self.n_replays = function, function(), 0
+
+    def replay(self) -> Any:
+        self.n_replays += 1
+        again = self.function()
+        self.result._numbers.copy_(again._numbers)
+        for (_, old), (_, new) in zip(self.result._gradients, again._gradients, strict=True):
+            assert (old is None) == (new is None)
+            if old is not None:
+                old.copy_(new)
+        return self.result
+
+
+class MemoryWithoutGPU(GraphMemory):
+    """Memory of what is recorded where there is no GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.recordings: list[Rerun] = []
+
+    def record(self, function: Callable[[], Any], device: th.device) -> Any:
+        assert device.type == "cpu"
+        self.recordings.append(Rerun(function))
+        return self.recordings[-1]
+
+
+class Recorder:
+    """Lets updates be recorded without a GPU, and keeps what a test wants to see."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.memory, self.updates = MemoryWithoutGPU(), list[Any]()
+        monkeypatch.setattr(algorithm_module, "record_losses", self.record)
+
+    def record(self, _: Any, update: FlowUpdate) -> None:
+        self.updates.append(weakref.ref(update))
+        parameters = list(update.policy.parameters())
+        update.recorded_loss = LossGraph(update.loss, parameters, update.batch_size, self.memory)
+
+
+def learn(algorithm: type[Any], **options: Any) -> Any:
+    sizes: dict[str, Any] = {"n_steps": 64, "batch_size": 24, "n_epochs": 2, "seed": 0}
+    return train(algorithm("MlpPolicy", "Pendulum-v1", **sizes, **options), 3 * 64)
 
 
 @pytest.mark.usefixtures("no_kernels")
-def test_what_is_recorded_is_the_update(
+def test_updates_are_the_same_without_a_gpu(
     algorithm: type[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a GPU: what a graph would record trains as the formulas do."""
-
-    def learn() -> Any:
-        options: dict[str, Any] = {"n_steps": 64, "batch_size": 24, "n_epochs": 2, "seed": 0}
-        return train(algorithm("MlpPolicy", "Pendulum-v1", n_critic_warmup=1, **options), 192)
-
-    plain, updates = learn(), []
-
-    def record(update: FlowUpdate) -> None:
-        updates.append(update)
-        parameters = update.policy.parameters()
-        update.recorded_loss = LossGraph(update.loss, parameters, 24, NeverWarm())
-
-    monkeypatch.setattr(algorithm_module, "record_losses", record)
-    model = learn()
-    assert len(updates) == 3
+    """64 samples are two minibatches of full size, and one that is smaller."""
+    plain = learn(algorithm, n_critic_warmup=1)
+    recorder = Recorder(monkeypatch)
+    model = learn(algorithm, n_critic_warmup=1)
+    # Of the first update, one minibatch of full size is evaluated before any is recorded.
+    assert [each.n_replays for each in recorder.memory.recordings] == [3, 4, 4]
     assert th.equal(weights(model), weights(plain))
     logged = plain.logger.name_to_value
     for key in [key for key in logged if key.startswith("train/")]:
         assert model.logger.name_to_value[key] == logged[key], key
+
+
+@pytest.mark.usefixtures("no_kernels")
+def test_updates_do_not_outlive_their_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Recorder(monkeypatch)
+    gc.disable()
+    try:
+        learn(PolicyFlow)
+        assert len(recorder.updates) == 3
+        assert all(update() is None for update in recorder.updates)
+    finally:
+        gc.enable()
+
+
+class Replacing(th.optim.SGD):
+    """Gives each parameter new memory in each step."""
+
+    def step(self, closure: Any = None) -> None:
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    parameter.data = parameter.data - group["lr"] * parameter.grad
+
+
+@pytest.mark.usefixtures("no_kernels")
+def test_parameters_that_are_replaced_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = {"policy_kwargs": {"optimizer_class": Replacing, "initialization": "glorot"}}
+    plain = learn(PolicyFlow, **options)
+    recorder = Recorder(monkeypatch)
+    model = learn(PolicyFlow, **options)
+    assert sum(each.n_replays for each in recorder.memory.recordings) <= len(recorder.updates)
+    assert th.equal(weights(model), weights(plain))
+
+
+class OwnSteps(PolicyFlow):
+    def _optimize(self, *arguments: Any) -> None:
+        super()._optimize(*arguments)
+
+
+class BareUpdate(PolicyFlowUpdate, may_be_recorded=True):
+    """As much of an update on a GPU as decides on recording."""
+
+    def __init__(self) -> None:
+        self.batch_size, self.recorded_loss = 8, None
+        self.policy = mock.Mock(device=th.device("cuda"), **{"parameters.return_value": []})
+
+
+def test_steps_of_ones_own_are_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graphs_module, "reason_graphs_are_off", lambda _: None)
+    for cls in (PolicyFlow, OwnSteps):
+        update = BareUpdate()
+        graphs_module.record_losses(object.__new__(cls), update)
+        assert (update.recorded_loss is not None) == (cls is PolicyFlow)
 
 
 @needs_gpu
@@ -275,8 +369,9 @@ def test_what_is_recorded_is_the_update(
     [
         (PolicyFlow, {"uniform_noise_coef": 1.0}, "uniform_noise_loss"),
         (FPO, {"ent_coef": 0.1}, "entropy_loss"),
+        (DPPO, {"ent_coef": 0.1}, "entropy_loss"),
     ],
-    ids=["policyflow", "fpo"],
+    ids=["policyflow", "fpo", "dppo"],
 )
 def test_random_numbers_in_the_loss(
     algorithm: Any, option: dict[str, Any], metric: str, monkeypatch: pytest.MonkeyPatch
@@ -348,12 +443,17 @@ def test_reasons_on_a_gpu() -> None:
         ({"net_arch": {"pi": [8], "vf": []}}, "for the critic, a network has no hidden layers"),
     ):
         assert part in str(reason(**options))
+    policy = make_policy().cuda()
+    handle = policy.log_std.register_hook(lambda gradient: gradient)
+    assert "parameters have hooks" in str(reason_training_is_slow(policy))
+    handle.remove()
+    assert reason_training_is_slow(policy) is None
 
 
 def test_formulas_of_ones_own_are_not_recorded() -> None:
-    assert PolicyFlowUpdate.has_known_formulas
-    assert not OwnUpdate.has_known_formulas
-    assert not FlowUpdate.has_known_formulas
+    assert PolicyFlowUpdate.may_be_recorded
+    assert not OwnUpdate.may_be_recorded
+    assert not FlowUpdate.may_be_recorded
 
 
 @needs_gpu
@@ -384,7 +484,7 @@ def test_images_and_dictionaries() -> None:
     for is_recorded in (True, False):
         with pytest.MonkeyPatch.context() as patch:
             if not is_recorded:
-                patch.setattr(algorithm_module, "record_losses", lambda _: None)
+                patch.setattr(algorithm_module, "record_losses", lambda *_: None)
             options = {**OPTIONS, "batch_size": 16}
             model = PolicyFlow("MultiInputPolicy", Images(), device="cuda", **options)
             results.append(weights(train(model, 3 * 64)))

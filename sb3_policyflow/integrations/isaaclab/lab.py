@@ -5,6 +5,7 @@ import difflib
 import importlib
 import importlib.util
 import inspect
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -159,8 +160,20 @@ def wrap(env: Any, bounds: tuple[float, float]) -> VecEnv:
 
     :param env: What ``gymnasium.make`` returned.
     :param bounds: Bounds for actions that have none.
-    :raises LabError: If observations are images, and IsaacLab's wrapper cannot have these bounds.
+    :raises LabError: If the bounds cannot be used, or there are several agents.
     """
+    low, high = bounds
+    if not -math.inf < low < high < math.inf:
+        raise LabError(
+            f"--action_bounds must be two finite numbers, the lower one first, not {low:g} and "
+            f"{high:g}."
+        )
+    if not hasattr(env.unwrapped, "single_observation_space"):
+        raise LabError(
+            f"{type(env.unwrapped).__name__} has several agents, and PolicyFlow trains one: choose "
+            "another task, or wrap it with isaaclab.envs.multi_agent_to_single_agent in a script "
+            "of your own."
+        )
     if are_vectors(env.unwrapped.single_observation_space[GROUP]):
         return TensorEnvAdapter(IsaacLabTensorEnv(env, bounds))
     return wrap_for_arrays(env, bounds)

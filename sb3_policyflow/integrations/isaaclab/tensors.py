@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_policyflow.envs.tensor import TensorObs, TensorStep, map_observations
+from sb3_policyflow.resilience.saving import preserve_rng_state
 
 GROUP = "policy"
 """The group of observations that a policy is given, as in IsaacLab's wrapper for SB3."""
@@ -38,8 +39,13 @@ class IsaacLabTensorEnv:
             )
 
     def seed(self, seed: int) -> None:
-        """Seed what the simulation draws from now on."""
-        self.env.unwrapped.seed(seed)
+        """Seed what the simulation draws from now on.
+
+        IsaacLab seeds Python's, NumPy's and torch's generators, too, from which a policy draws:
+        these are put back.
+        """
+        with preserve_rng_state(self.device):
+            self.env.unwrapped.seed(seed)
 
     def reset(self) -> TensorObs:
         observations, _ = self.env.reset()

@@ -80,6 +80,38 @@ def test_spaces() -> None:
     assert IsaacLabTensorEnv(env).action_space == spaces.Box(-3, 3, (2,))
 
 
+@THREE
+@pytest.mark.usefixtures("installed")
+def test_seeding_leaves_the_policys_generators_alone() -> None:
+    """IsaacLab's own seed sets those of NumPy and torch."""
+    env = IsaacLabTensorEnv(make_env())
+    th.manual_seed(1)
+    expected = th.randn(3)
+    th.manual_seed(1)
+    env.seed(7)
+    assert th.equal(th.randn(3), expected)
+    first = env.reset()
+    env.seed(7)
+    assert th.equal(env.reset(), first)
+
+
+@THREE
+@pytest.mark.parametrize("bounds", [(1.0, -1.0), (-np.inf, 1.0), (0.0, 0.0)])
+@pytest.mark.usefixtures("installed")
+def test_bounds_that_are_none(bounds: tuple[float, float]) -> None:
+    with pytest.raises(LabError, match="two finite numbers, the lower one first"):
+        wrap(make_env(), bounds)
+
+
+@THREE
+@pytest.mark.usefixtures("installed")
+def test_several_agents() -> None:
+    env = make_env()
+    del env.unwrapped.single_observation_space
+    with pytest.raises(LabError, match="LabEnv has several agents"):
+        wrap(env, BOUNDS)
+
+
 @EACH
 @pytest.mark.usefixtures("installed")
 def test_images_go_through_isaaclabs_wrapper(version: str) -> None:

@@ -56,6 +56,8 @@ class LabEnv(gym.Env[Any, Any]):
     def seed(self, seed: int | None = None) -> int | None:
         if seed is not None:
             self.generator.manual_seed(seed)
+            th.manual_seed(seed)
+            np.random.seed(seed)
         return seed
 
     def reset(self, **options: Any) -> Any:
