@@ -7,7 +7,7 @@ import torch as th
 
 T = TypeVar("T")
 CHUNK = 8192
-"""Small rows that a CPU evaluates at a time. A GPU is given as many as in training."""
+"""Small rows that are evaluated at a time; on a GPU as many as in training, if these are more."""
 SMALL_ROW = 1024
 """Numbers in a row up to which it is small. An image has more, and a features extractor makes
 several times as many of them: of images, no more are evaluated at a time than training does."""
