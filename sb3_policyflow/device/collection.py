@@ -273,7 +273,7 @@ def advantages_of(
     factors = buffer.gamma * buffer.gae_lambda * continues
     advantage = th.zeros_like(last_values)
     advantages = []
-    for delta, factor in zip(deltas.flip(0).unbind(), factors.flip(0).unbind(), strict=True):
+    for delta, factor in zip(deltas.unbind()[::-1], factors.unbind()[::-1], strict=True):
         advantage = delta + factor * advantage
         advantages.append(advantage)
     return th.stack(advantages[::-1])
