@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_policyflow.device.environments import tensors_behind
 from sb3_policyflow.distributed.ranks import current
+from sb3_policyflow.envs.tensor import TensorEnvAdapter
 from sb3_policyflow.integrations.isaaclab.checkpoint import Checkpoint, read_checkpoint
 from sb3_policyflow.integrations.isaaclab.lab import (
     Configured,
@@ -175,8 +175,7 @@ def train(
     moment = time.strftime("%Y-%m-%d_%H-%M-%S")
     folder = options.log_dir or Path("logs", "sb3_policyflow", options.task, moment)
     # Tensors of the simulator stay where it is, and so does the model.
-    tensors = tensors_behind(env)
-    device: Any = "auto" if tensors is None else tensors[0].env.device
+    device = env.env.device if isinstance(env, TensorEnvAdapter) else "auto"
     env = normalized(env, normalization, agent.get("gamma", 0.99), options.checkpoint)
     if options.checkpoint is None:
         model = PolicyFlow(
