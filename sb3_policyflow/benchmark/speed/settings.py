@@ -186,25 +186,27 @@ def isaaclab(embedding_dim: int, device: str) -> Setting:
 
     PolicyFlow with rollouts of tensors, and through arrays as PPO.
     """
-    setting = against_ppo(
-        f"4096 envs x 24, embedding {embedding_dim}",
-        lambda: GymVectorVecEnv(NoiseEnv(4096, 48, 12)),
-        {"n_steps": 24, "batch_size": 4096 * 24 // 4, "n_epochs": 5, "clip_range_vf": 0.2},
-        {"net_arch": [512, 256, 128], "activation_fn": th.nn.ELU},
-        {"brownian_coef": 0.01},
-        embedding_dim,
-        device,
-    )
-    arrays, ppo = setting.makers["PolicyFlow"], setting.makers["PPO"]
 
-    def tensors() -> OnPolicyAlgorithm:
-        model = arrays()
-        env: Any = NoiseTensorEnv(4096, 48, 12, device)
-        model.set_env(env)
-        return model
+    def by_route(make_env: Callable[[], Any]) -> Mapping[str, Make]:
+        return against_ppo(
+            title,
+            make_env,
+            {"n_steps": 24, "batch_size": 4096 * 24 // 4, "n_epochs": 5, "clip_range_vf": 0.2},
+            {"net_arch": [512, 256, 128], "activation_fn": th.nn.ELU},
+            {"brownian_coef": 0.01},
+            embedding_dim,
+            device,
+        ).makers
 
-    makers = {"PolicyFlow, tensors": tensors, "PolicyFlow, arrays": arrays, "PPO, arrays": ppo}
-    return Setting(setting.title, makers)
+    title = f"4096 envs x 24, embedding {embedding_dim}"
+    arrays = by_route(lambda: GymVectorVecEnv(NoiseEnv(4096, 48, 12)))
+    tensors = by_route(lambda: NoiseTensorEnv(4096, 48, 12, device))
+    makers = {
+        "PolicyFlow, tensors": tensors["PolicyFlow"],
+        "PolicyFlow, arrays": arrays["PolicyFlow"],
+        "PPO, arrays": arrays["PPO"],
+    }
+    return Setting(title, makers)
 
 
 MAIN: dict[str, Callable[[], Setting]] = {
