@@ -1,6 +1,6 @@
 """The flow from latents to end points in one call of a kernel."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -10,12 +10,10 @@ from sb3_policyflow.flows.folding import split_first_layer
 from sb3_policyflow.flows.modes import FIRST, relative_bandwidth
 from sb3_policyflow.flows.solvers import AdamsBashforth2, RungeKutta, solver_times
 from sb3_policyflow.flows.velocity import fourier_features
+from sb3_policyflow.kernels.field_parts import FieldParts
 from sb3_policyflow.kernels.inspection import addresses
 from sb3_policyflow.kernels.layouts import Choice, Floats, FoldedNetwork, Integers, Kernels, Method
 from sb3_policyflow.kernels.threads import in_parts, n_parts
-
-if TYPE_CHECKING:  # that module imports this one
-    from sb3_policyflow.kernels.fields import FieldParts
 
 MAX_PLANS = 8
 """Solvers that a field keeps plans for at the same time."""
@@ -79,7 +77,7 @@ class FlowPlans:
     def __reduce__(self) -> Any:
         return type(self), ()
 
-    def get(self, parts: "FieldParts", solver: str, n_steps: int, end_time: float) -> FlowPlan:
+    def get(self, parts: FieldParts, solver: str, n_steps: int, end_time: float) -> FlowPlan:
         """Return the plan for a solver.
 
         :param parts: The parts of the field, as they are now.
@@ -104,7 +102,7 @@ class _Snapshot:
     :param parts: The parts of the field.
     """
 
-    def __init__(self, parts: "FieldParts") -> None:
+    def __init__(self, parts: FieldParts) -> None:
         self._parts = parts
         self._copies = [tensor.clone() for tensor in parts.held]
         self._arguments = (
@@ -114,7 +112,7 @@ class _Snapshot:
         )
         self._plans: dict[tuple[str, int, float], FlowPlan] = {}
 
-    def is_current(self, parts: "FieldParts") -> bool:
+    def is_current(self, parts: FieldParts) -> bool:
         """Whether the field has these parts and they are what they were."""
         return parts is self._parts and parts.kernels.are_same(*self._arguments)
 
@@ -132,7 +130,7 @@ class _Snapshot:
 
 @th.no_grad()
 def _make_plan(
-    parts: "FieldParts", weights: list[th.Tensor], solver: str, n_steps: int, end_time: float
+    parts: FieldParts, weights: list[th.Tensor], solver: str, n_steps: int, end_time: float
 ) -> FlowPlan:
     """Make a plan for a solver.
 

@@ -12,10 +12,8 @@ from threading import Lock
 from typing import Any, Generic, TypeVar
 
 import torch as th
-from torch import nn
 
 from sb3_policyflow.kernels.compiler import SWITCH
-from sb3_policyflow.kernels.inspection import KernelView
 
 MAX_GRAPHS = 8
 """Shapes and solvers that a field remembers at the same time."""
@@ -136,40 +134,28 @@ class FlowGraphs:
 
     There is one for each solver and each shape of latents that has been seen twice. All are
     forgotten when the field has other parts. A copy has none, and threads may share them.
-
-    :param read: Reads the parts of a field, see :class:`~.inspection.KernelView`.
     """
 
-    def __init__(self, read: Callable[..., Any]) -> None:
-        self._read = read
-        self._view: KernelView[Any] = KernelView(read, "cuda")
+    def __init__(self) -> None:
         self._parts: object = None
         self._replays: dict[Any, _Replay | None] = {}
         self._memories: dict[Any, GraphMemory] = {}
         self._lock = Lock()
 
     def __reduce__(self) -> Any:
-        return type(self), (self._read,)
-
-    def reason_off(self, field: nn.Module) -> str | None:
-        """Why there are none for a field; None if there are.
-
-        :param field: The field.
-        """
-        parts = self._view.of(field)
-        return parts if isinstance(parts, str) else None
+        return type(self), ()
 
     def run(
         self,
-        field: nn.Module,
+        parts: object,
         integrate: Callable[[th.Tensor, th.Tensor], th.Tensor],
         latents: th.Tensor,
         features: th.Tensor,
         method: tuple[Any, ...],
     ) -> th.Tensor | None:
-        """End points of the flow, shape (n, dim).
+        """End points of the flow, shape (n, dim), without gradients.
 
-        :param field: The velocity field.
+        :param parts: What the velocity field consists of now.
         :param integrate: What a graph records: carries latents and features to end points.
         :param latents: Shape (n, dim).
         :param features: Shape (n, features_dim).
@@ -177,10 +163,9 @@ class FlowGraphs:
         :return: None where a graph cannot be used, or is not worth it yet.
         """
         inputs = (latents, features)
-        if th.is_grad_enabled() or th.is_inference_mode_enabled() or not _are_plain(inputs):
+        if th.is_inference_mode_enabled() or not _are_plain(inputs):
             return None
-        parts = self._view.of(field)
-        if isinstance(parts, str) or th.cuda.is_current_stream_capturing():
+        if th.cuda.is_current_stream_capturing():
             return None
         shapes = latents.shape, features.shape
         place = latents.device, th.cuda.current_stream(latents.device).cuda_stream

@@ -120,6 +120,11 @@ class ModuleInspector:
         return activation
 
 
+def have_hooks(parameters: Iterable[th.Tensor]) -> bool:
+    """Whether anything watches or changes the gradients of some parameters."""
+    return any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters)
+
+
 class Parts(Protocol):
     """What a module consists of, as it was at one moment; nothing of it changes."""
 

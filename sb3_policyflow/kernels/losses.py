@@ -9,8 +9,9 @@ import torch as th
 
 from sb3_policyflow.kernels.compiler import note_fallback
 from sb3_policyflow.kernels.critic import read_critic
-from sb3_policyflow.kernels.fields import Embedding, FieldParts, KernelVelocityField
-from sb3_policyflow.kernels.inspection import KernelView, are_usable
+from sb3_policyflow.kernels.field_parts import FieldParts
+from sb3_policyflow.kernels.fields import Embedding, KernelVelocityField
+from sb3_policyflow.kernels.inspection import KernelView, are_usable, have_hooks
 from sb3_policyflow.kernels.layouts import (
     BROWNIAN,
     CHANGE,
@@ -105,7 +106,7 @@ class KernelLoss:
             return None
         log_std = policy.noise_log_std
         parameters = [log_std, *actor.parameters, *critic.tensors]
-        if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters):
+        if have_hooks(parameters):
             note_fallback("parameters have hooks")
             return None
         is_known = actor.supports(inputs.points, inputs.features)

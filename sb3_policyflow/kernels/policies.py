@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from sb3_policyflow.flows.folding import has_hooks
 from sb3_policyflow.kernels.critic import read_critic
 from sb3_policyflow.kernels.fields import KernelVelocityField
-from sb3_policyflow.kernels.inspection import KernelView
+from sb3_policyflow.kernels.inspection import KernelView, have_hooks
 from sb3_policyflow.kernels.threads import kernels_have_the_cores
 
 OF_ACTOR_AND_CRITIC = (
@@ -31,13 +31,7 @@ def reason_kernels_are_off(policy: Any) -> str | None:
     :param policy: A policy whose ``velocity`` :func:`make_velocity_field` made, with SB3's critic.
     :return: A part of a sentence; None if they work on actor and critic.
     """
-    if not isinstance(policy.velocity, KernelVelocityField):
-        return f"{type(policy.velocity).__name__} is not a velocity field of kernels"
-    actor = policy.velocity.parts()
-    if isinstance(actor, str):
-        return actor
-    critic = KernelView(read_critic).of(policy)
-    return f"for the critic, {critic}" if isinstance(critic, str) else None
+    return _why_unread(policy, "cpu")
 
 
 def reason_graphs_are_off(policy: Any) -> str | None:
@@ -50,17 +44,23 @@ def reason_graphs_are_off(policy: Any) -> str | None:
         return "torch looks for anomalies"
     if not type(policy).__module__.startswith("sb3_policyflow."):
         return f"{type(policy).__name__} is a policy of your own"
-    if not isinstance(policy.velocity, KernelVelocityField):
-        return f"{type(policy.velocity).__name__} is not a velocity field of kernels"
-    if (reason := policy.velocity.reason_graphs_are_off()) is not None:
+    if (reason := _why_unread(policy, "cuda")) is not None:
         return reason
-    critic = KernelView(read_critic, "cuda").of(policy)
-    if isinstance(critic, str):
-        return f"for the critic, {critic}"
-    if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in policy.parameters()):
+    if have_hooks(policy.parameters()):
         return "parameters have hooks"
     extractors = policy.pi_features_extractor, policy.vf_features_extractor
     return next(filter(None, map(_why_unknown, extractors)), None)
+
+
+def _why_unread(policy: Any, device: str) -> str | None:
+    """Why a policy's actor and critic cannot be read on a device of this type."""
+    if not isinstance(policy.velocity, KernelVelocityField):
+        return f"{type(policy.velocity).__name__} is not a velocity field of kernels"
+    actor = policy.velocity.parts(device)
+    if isinstance(actor, str):
+        return actor
+    critic = KernelView(read_critic, device).of(policy)
+    return f"for the critic, {critic}" if isinstance(critic, str) else None
 
 
 def _why_unknown(extractor: Any) -> str | None:
