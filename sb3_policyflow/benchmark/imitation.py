@@ -15,7 +15,13 @@ from typing import Any
 from sb3_policyflow.benchmark.errors import BenchmarkError, at_least, require_env
 from sb3_policyflow.benchmark.figures.goals import goals_figure
 from sb3_policyflow.benchmark.measure.goals import GoalReport
-from sb3_policyflow.benchmark.multigoal import ENV, N_TRAJECTORIES, ROLLOUTS, load_trajectories
+from sb3_policyflow.benchmark.multigoal import (
+    ENV,
+    N_TRAJECTORIES,
+    PAPER,
+    ROLLOUTS,
+    load_trajectories,
+)
 from sb3_policyflow.benchmark.report.markdown import markdown_table
 from sb3_policyflow.benchmark.report.statistics import over_seeds
 from sb3_policyflow.benchmark.report.table import seeds_caption, steps_trained
@@ -58,6 +64,7 @@ MULTI_GOAL = Task(
     algorithms={
         # Values of up to 10 are not clipped by 100.
         "policyflow": ROLLOUTS
+        | PAPER
         | {
             "desired_kl": None,
             "lr_adaptation_kwargs": None,

@@ -36,7 +36,10 @@ HEADER = (
 ROLLOUTS = {"n_envs": 1024, "n_steps": 24, "batch_size": 1536, "n_epochs": 5}
 """Alike for all; smaller minibatches than the paper's 6144 do all of them good."""
 
-PLAIN = ROLLOUTS | {"normalize_advantage": False, "brownian_coef": 0.0, "ent_coef": 0.0}
+PAPER = {"gae_lambda": 0.95, "clip_range_vf": 0.2, "critic_learning_rate": None}
+"""The paper's, where those of ``policyflow.yml``, which are made for the demo, are others."""
+
+PLAIN = ROLLOUTS | PAPER | {"normalize_advantage": False, "brownian_coef": 0.0, "ent_coef": 0.0}
 """PolicyFlow without what keeps it from becoming narrow.
 
 Advantages that are divided by their deviation would make much of the small differences that are
