@@ -5,14 +5,15 @@ from typing import Any, ClassVar, cast
 
 import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import explained_variance, update_learning_rate
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import explained_variance
 from typing_extensions import Self
 
 from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.former_names import keep_former_defaults
 from sb3_policyflow.common.graphs import record_losses
+from sb3_policyflow.common.learning_rates import ScheduledOnPolicyAlgorithm
 from sb3_policyflow.common.minibatches import (
     FlowRolloutBufferSamples,
     Minibatches,
@@ -27,9 +28,7 @@ from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import (
     Coefficient,
     KLAdaptiveLearningRate,
-    adapt_learning_rate,
     parse_schedule,
-    start_adaptive_learning_rate,
 )
 from sb3_policyflow.common.update import (
     FlowUpdate,
@@ -38,13 +37,16 @@ from sb3_policyflow.common.update import (
     check_model,
 )
 from sb3_policyflow.device import environments
-from sb3_policyflow.distributed.ranks import Ranks, join, training_of
+from sb3_policyflow.distributed.ranks import join, training_of
 from sb3_policyflow.kernels import reason_training_is_slow, shares_cores
-from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
+from sb3_policyflow.resilience.guarded import GuardedOnPolicyAlgorithm
+from sb3_policyflow.resilience.resumable import ResumableOnPolicyAlgorithm
 from sb3_policyflow.resilience.training import LearnArguments
 
 
-class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
+class FlowOnPolicyAlgorithm(
+    GuardedOnPolicyAlgorithm, ResumableOnPolicyAlgorithm, ScheduledOnPolicyAlgorithm
+):
     """PPO's update around what a sibling says of its policy, its :class:`FlowUpdate`.
 
     Takes the arguments of SB3's PPO, in its order and with its meanings, except that gSDE is not
@@ -83,24 +85,15 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     divergence_advice: ClassVar[str] = ""
     """What else than a lower learning rate helps against gradients that are not finite."""
     option_checks: ClassVar[Mapping[str, checks.Check]] = options.SHARED_CHECKS
-    unsaved = (
-        *ResilientOnPolicyAlgorithm.unsaved,
-        *("ranks", "_learning_rates", "known_policy_options"),
-    )
     model_checks: ClassVar[tuple[Callable[[Any], None], ...]] = ()
     """Functions that refuse a model whose options do not go together."""
     trust_region: str = "ppo"
-    ranks: Ranks
-    """The processes that train this model."""
     n_rollouts: int = 0
     """Rollouts that the model has learned from."""
-    adaptive_learning_rate: float | None = None
-    _adaptive_start: float | None = None  # the learning rate that the adaptive one started with
     cloned_parameters: dict[str, Any] | None = None
     """Those of the policy after it was cloned from demonstrations."""
     policy: FlowPolicy
     rollout_buffer: FlowRolloutBuffer | DictFlowRolloutBuffer
-    _learning_rates: tuple[Any, Schedule]  # the rate, and the schedule that was made of it
     # Environments may be of tensors too.
     _wrap_env = staticmethod(environments.wrap)
     _collect = environments.collect
@@ -205,49 +198,16 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
         self.clip_range = parse_schedule("clip_range", self.clip_range)
         if self.clip_range_vf is not None:
             self.clip_range_vf = parse_schedule("clip_range_vf", self.clip_range_vf)
-        start_adaptive_learning_rate(self)
+        self._start_adaptive_learning_rate()
         check_model(self)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
 
-    def value_of(self, name: str) -> float:
-        """The value of an option that may be a schedule, at the present progress.
-
-        :param name: The option, such as "ent_coef".
-        """
-        schedule = parse_schedule(name, getattr(self, name))
-        return float(schedule(self._current_progress_remaining))
-
-    def _setup_lr_schedule(self) -> None:
-        self.lr_schedule = parse_schedule("learning_rate", self.learning_rate)
-        self._learning_rates = self.learning_rate, self.lr_schedule
-
-    def read_learning_rate(self) -> None:
-        """Take up a ``learning_rate`` or ``lr_schedule`` that has been set."""
-        learning_rate, schedule = self._learning_rates
-        if self.lr_schedule is not schedule:
-            self.learning_rate = self.lr_schedule
-        if self.learning_rate is not learning_rate:
-            self._setup_lr_schedule()
-
-    def _update_learning_rate(
-        self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
-    ) -> None:
-        options.take_up_changes(self)
-        start_adaptive_learning_rate(self)
-        if self.critic_learning_rate is not None:
-            rate = self.value_of("critic_learning_rate")
-            self.logger.record("train/critic_learning_rate", rate)
-        if self.adaptive_learning_rate is None:
-            super()._update_learning_rate(optimizers)
-            return
-        self.logger.record("train/learning_rate", self.adaptive_learning_rate)
-        update_learning_rate(self.policy.optimizer, self.adaptive_learning_rate)
-
     @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
+        options.take_up_changes(self)
         self._update_learning_rate(self.policy.optimizer)
         rollout = self._rollout()
         self.policy.set_training_mode(False)
@@ -268,7 +228,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
                 if not stop:
                     self._optimize(loss, parameters, update)  # lines 22 and 23
                 if stop or rule.interval == "minibatch":
-                    adapt_learning_rate(self, rule, kls[-1:], update.trains_actor)
+                    self._adapt_learning_rate(rule, kls[-1:], update.trains_actor)
                 if stop:
                     self.logger.info(f"Early stopping due to reaching max kl: {kls[-1].item():.2f}")
                     break
@@ -276,7 +236,7 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
             if stop:
                 break
             if rule.interval == "epoch":
-                adapt_learning_rate(self, rule, kls, update.trains_actor)
+                self._adapt_learning_rate(rule, kls, update.trains_actor)
         self._log_update(loss, th.stack(kls).mean(), metrics)
 
     def _rollout(self) -> FlowRolloutBufferSamples:
@@ -329,6 +289,9 @@ class FlowOnPolicyAlgorithm(ResilientOnPolicyAlgorithm):
     def _prepare_saving(self) -> None:
         options.note_changed_options(self)
         self.read_learning_rate()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "ranks", "known_policy_options"]
 
     def learn(
         self,

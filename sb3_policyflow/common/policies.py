@@ -2,13 +2,11 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     FlattenExtractor,
@@ -20,6 +18,7 @@ from torch import nn
 
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.former_names import FormerAttribute, accepts_former_names
+from sb3_policyflow.common.latents import LatentPolicy
 from sb3_policyflow.common.names import (
     WithoutLikelihood,
     check_overridden_methods,
@@ -27,7 +26,6 @@ from sb3_policyflow.common.names import (
 )
 from sb3_policyflow.common.optimization import make_optimizer
 from sb3_policyflow.flows import INITIALIZATIONS, VelocityField
-from sb3_policyflow.flows.modes import candidate_latents, densest_endpoints
 from sb3_policyflow.kernels import (
     GraphMemory,
     KernelCritic,
@@ -38,10 +36,9 @@ from sb3_policyflow.kernels import (
 from sb3_policyflow.resilience.finite import check_actions
 
 NetArch = list[int] | dict[str, list[int]]
-LatentsAndEnds = tuple[th.Tensor, th.Tensor | None]
 
 
-class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
+class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
     """An actor-critic policy whose actor is a velocity field.
 
     ``forward`` returns actions, values and a record: a NamedTuple of tensors that says how the
@@ -153,11 +150,6 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
         own = [option.name for option in own_options(type(self)) if hasattr(self, option.name)]
         return {**data, **{name: getattr(self, name) for name in (*self.shared_options, *own)}}
 
-    @cached_property
-    def action_dim(self) -> int:
-        """Number of action dimensions, whatever the shape of the Box."""
-        return get_action_dim(self.action_space)
-
     def _layers(self, head: str) -> list[int]:
         """Hidden layers of the actor ("pi") or the critic ("vf")."""
         arch = self.net_arch
@@ -248,54 +240,8 @@ class FlowPolicy(WithoutLikelihood, ActorCriticPolicy):
 
     @property
     @abstractmethod
-    def latent_scale(self) -> float | th.Tensor:
-        """Standard deviation of the latents: a number, or one for each dimension of the action."""
-
-    def draw_latents(self, features: th.Tensor, deterministic: bool) -> LatentsAndEnds:
-        """Latents z ~ N(0, latent_scale^2) or the deterministic action's; their ends, if known."""
-        scale, choice = self.latent_scale, self.deterministic_action
-        if (deterministic and choice == "zero") or (isinstance(scale, float) and scale == 0.0):
-            return features.new_zeros(features.shape[0], self.action_dim), None
-        if not deterministic or choice == "drawn":
-            size = (features.shape[0], self.action_dim)  # len() would fix it when exporting
-            return scale * th.randn(size, device=features.device, dtype=features.dtype), None
-        if isinstance(scale, float):
-            candidates = candidate_latents(self.action_dim, scale).to(features)
-        else:
-            candidates = scale * candidate_latents(self.action_dim).to(features)
-        return self.choose_latents(candidates, features)
-
-    def choose_latents(
-        self, candidates: th.Tensor, features: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """Of latents (k, action_dim) the one whose end point has the most others around it.
-
-        :param candidates: The latents to choose from.
-        :param features: The actor's features, shape (n, features_dim).
-        :return: For each row of features the latent, and its end point, each (n, action_dim).
-        """
-        return densest_endpoints(self.transport, candidates, features)
-
-    def draw_endpoints(
-        self, features: th.Tensor, deterministic: bool
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """Latents, see :meth:`draw_latents`, and their end points, each (n, action_dim)."""
-        latents, found = self.draw_latents(features, deterministic)
-        return latents, self.transport(latents, features) if found is None else found
-
-    @property
-    @abstractmethod
     def n_evaluations_per_action(self) -> int:
         """Evaluations of the velocity field for one action."""
-
-    @abstractmethod
-    def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """Transport latents to actions, without noise on the way or at the end.
-
-        :param latents: z, shape (n, action_dim).
-        :param features: The actor's features, shape (n, features_dim).
-        :return: Shape (n, action_dim).
-        """
 
     @abstractmethod
     def sample_actions(

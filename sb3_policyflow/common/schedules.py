@@ -5,14 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch as th
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import (
-    ConstantSchedule,
-    FloatSchedule,
-    LinearSchedule,
-    update_learning_rate,
-)
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_policyflow.common import checks
 
@@ -155,34 +149,3 @@ def check_desired_kl(desired_kl: Coefficient, learning_rate: object) -> None:
             "With desired_kl the learning rate follows the divergence of the policy: give the "
             "learning_rate that it starts with, not a schedule."
         )
-
-
-def start_adaptive_learning_rate(model: Any) -> None:
-    """Start with ``learning_rate``, unless a run continues that started with it.
-
-    :param model: An algorithm, whose ``adaptive_learning_rate`` is None without ``desired_kl``.
-    """
-    start = model.lr_schedule(1.0)
-    if model.desired_kl is None:
-        model.adaptive_learning_rate = None
-    elif model.adaptive_learning_rate is None or start != model._adaptive_start:
-        model.adaptive_learning_rate = start
-    model._adaptive_start = start
-
-
-def adapt_learning_rate(
-    model: Any, rule: KLAdaptiveLearningRate, kls: list[th.Tensor], trains_actor: bool
-) -> None:
-    """Move the learning rate of a model, if it is adaptive.
-
-    :param model: An algorithm.
-    :param rule: How it moves.
-    :param kls: Divergences whose mean, over the ranks too, it follows.
-    :param trains_actor: Whether the actor learns; else there is no reason to learn faster.
-    """
-    if model.adaptive_learning_rate is None or not trains_actor:
-        return
-    kl = model.ranks.mean(th.stack(kls).mean())
-    rate = rule.adapt(model.adaptive_learning_rate, kl, model.value_of("desired_kl"))
-    model.adaptive_learning_rate = rate
-    update_learning_rate(model.policy.optimizer, rate)

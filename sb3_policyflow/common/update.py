@@ -101,9 +101,8 @@ class FlowUpdate(ABC):
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
         self.critic_rate: OwnRate | None = None
-        if algorithm.critic_learning_rate is not None:
-            critic = frozenset(self.policy.critic_parameters())
-            self.critic_rate = OwnRate(critic, algorithm.value_of("critic_learning_rate"))
+        if (rate := algorithm.critic_rate()) is not None:
+            self.critic_rate = OwnRate(frozenset(self.policy.critic_parameters()), rate)
         self.pull: ImitationPull | None = None
         if (coef := algorithm.value_of("imitation_coef")) > 0:
             self.pull = ImitationPull(algorithm.policy, algorithm.cloned_parameters, coef)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_policyflow.resilience.algorithm import ResilientOnPolicyAlgorithm
+from sb3_policyflow.resilience.resumable import ResumableOnPolicyAlgorithm
 
 
 def read_statistics(path: str | Path) -> VecNormalize:
@@ -28,7 +28,7 @@ def read_statistics(path: str | Path) -> VecNormalize:
 
 
 def check_normalization(
-    model: ResilientOnPolicyAlgorithm,
+    model: ResumableOnPolicyAlgorithm,
     normalize: VecNormalize | None,
     name: str,
     otherwise: str = "",
