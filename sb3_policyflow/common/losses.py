@@ -177,6 +177,19 @@ def matched_outputs(policy: Any, drawn: MatchingSamples, features: th.Tensor) ->
     return outputs
 
 
+def matching_losses(policy: Any, features: th.Tensor, endpoints: th.Tensor) -> th.Tensor:
+    """How badly a policy's network leads to end points, shape (n,).
+
+    :param policy: The policy, which draws the points on the way.
+    :param features: The actor's features, shape (n, features_dim).
+    :param endpoints: Actions before their shape is that of their space, shape (n, action_dim).
+    """
+    drawn = policy.draw_matching(endpoints)
+    error = matched_outputs(policy, drawn, features) - drawn.targets
+    losses: th.Tensor = drawn.weights * error.square().sum(dim=-1)
+    return losses
+
+
 class ImitationPull:
     """Pulls a policy towards the one that was cloned from demonstrations.
 

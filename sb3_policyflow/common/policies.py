@@ -19,6 +19,7 @@ from torch import nn
 from sb3_policyflow.common import checks
 from sb3_policyflow.common.former_names import FormerAttribute, accepts_former_names
 from sb3_policyflow.common.latents import LatentPolicy
+from sb3_policyflow.common.losses import matching_losses
 from sb3_policyflow.common.names import (
     WithoutLikelihood,
     check_overridden_methods,
@@ -277,6 +278,21 @@ class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
         if has_values():
             check_actions(actions)
         return actions.reshape(-1, *self.action_space.shape)
+
+    def cloning_losses(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """The losses of demonstrated actions, whose mean cloning minimizes, shape (n,).
+
+        :param features: The actor's features, shape (n, features_dim).
+        :param actions: What was demonstrated, shape (n, action_dim).
+        """
+        return matching_losses(self, features, actions)
+
+    def finish_cloning(self, noise_std: float | None) -> None:
+        """Let what depends on the actor follow it once it was cloned from demonstrations.
+
+        :param noise_std: Standard deviation of the noise to go on with, see
+            :func:`sb3_policyflow.imitation.clone`; None for the default.
+        """
 
     def keep_within_bounds(self) -> None:
         """Clamp parameters that have bounds, after a step of the optimizer."""

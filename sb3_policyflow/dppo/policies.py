@@ -190,6 +190,11 @@ class DPPOPolicy(FlowPolicy):
             if self._has_own_networks:
                 self.base_mlp_extractor.load_state_dict(self.mlp_extractor.state_dict())
 
+    def finish_cloning(self, noise_std: float | None) -> None:
+        """Freeze what was cloned; the noise is the chain's own."""
+        super().finish_cloning(noise_std)
+        self.freeze_base()
+
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
         """Features for the actor, shape (n, features_dim).
 

@@ -1,29 +1,22 @@
 """Cloning: supervised training of a policy's actor on demonstrations."""
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_policyflow.flows.bounds import half_ranges
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.imitation.demonstrations import load_demonstrations
 from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
 from sb3_policyflow.imitation.samples import CloningSamples
 from sb3_policyflow.imitation.training import CloningRun
-from sb3_policyflow.policyflow import PolicyFlowPolicy
 
 Model = TypeVar("Model", bound=OnPolicyAlgorithm)
-DEFAULT_NOISE = 0.1
-"""PolicyFlow's noise after cloning, in halves of the distance of the actions' bounds; where there
-are none that mean something, as if they were -1 and 1."""
 
 
 def clone(
@@ -49,8 +42,7 @@ def clone(
     Logged are ``imitation/loss``, ``validation_loss``, ``best_validation_loss``, ``learning_rate``
     and ``gradient_steps``. Callbacks are asked after each gradient step, and may stop the cloning.
 
-    >>> import numpy as np
-    >>> from sb3_policyflow import PolicyFlow
+    >>>     >>> from sb3_policyflow import PolicyFlow
     >>> shown = np.random.randn(256, 3), np.zeros((256, 1))
     >>> model = clone(PolicyFlow("MlpPolicy", "Pendulum-v1"), shown, gradient_steps=20)
 
@@ -91,42 +83,13 @@ def clone(
     run = CloningRun(model, CloningSamples(model, shown), chosen)
     with _prepared(model, callback) as asked:
         run.train(asked, progress_bar)
-    finish(model, chosen.noise_std)
-    return model
-
-
-def finish(model: Any, noise_std: float | None) -> None:
-    """Let everything that depends on the cloned networks follow them.
-
-    :param model: The model.
-    :param noise_std: See :func:`clone`.
-    """
     policy = model.policy
-    if isinstance(policy, PolicyFlowPolicy) and not policy.gaussian:
-        _set_noise(policy, noise_std)
-    if hasattr(policy, "freeze_base"):
-        policy.freeze_base()
-    if hasattr(model, "cloned_parameters"):
+    if isinstance(policy, FlowPolicy):
+        policy.finish_cloning(chosen.noise_std)
         state = policy.state_dict()
-        model.cloned_parameters = {name: values.cpu().numpy() for name, values in state.items()}
-
-
-def _set_noise(policy: PolicyFlowPolicy, noise_std: float | None) -> None:
-    box: Any = policy.action_space
-    ranges = half_ranges(box.low, box.high)
-    stds = DEFAULT_NOISE * np.where(np.isfinite(ranges), ranges, 1.0)
-    if noise_std is not None:
-        stds = np.full_like(stds, noise_std)
-    wanted = th.as_tensor(np.log(stds)).to(policy.log_std)
-    with th.no_grad():
-        policy.log_std.copy_(wanted)
-    policy.keep_within_bounds()
-    if not th.allclose(policy.log_std, wanted):
-        warnings.warn(
-            f"The noise after cloning is {policy.log_std.exp().mean():.3g} and not "
-            f"{wanted.exp().mean():.3g}, because of log_std_bounds={policy.log_std_bounds}.",
-            stacklevel=4,
-        )
+        cloned = {name: values.cpu().numpy() for name, values in state.items()}
+        model.cloned_parameters = cloned  # type: ignore[attr-defined]
+    return model
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_policyflow.common.optimization import clip_gradients, make_optimizer
+from sb3_policyflow.common.policies import FlowPolicy
 from sb3_policyflow.common.schedules import parse_schedule
-from sb3_policyflow.imitation.losses import cloning_losses
 from sb3_policyflow.imitation.options import CloningOptions
 from sb3_policyflow.imitation.samples import CloningSamples
 from sb3_policyflow.resilience.files import atomic_write
@@ -95,7 +95,7 @@ class CloningRun:
             self._optimizer, self._rate(1 - self.step / self._options.gradient_steps)
         )
         self._policy.set_training_mode(True)
-        loss = cloning_losses(self._policy, *self._samples.batch(self._next_batch())).mean()
+        loss = self._losses_of(self._next_batch()).mean()
         for parameter in self._parameters:
             parameter.grad = None
         th.autograd.backward(loss)
@@ -106,10 +106,19 @@ class CloningRun:
                 "are not finite among the observations, or lower the learning rate."
             )
         self._optimizer.step()
-        if hasattr(self._policy, "keep_within_bounds"):
+        if isinstance(self._policy, FlowPolicy):
             self._policy.keep_within_bounds()
         self._losses.append(loss.item())
         self.step += 1
+
+    def _losses_of(self, transitions: np.ndarray) -> th.Tensor:
+        """The losses of transitions, given by their numbers, shape (n,)."""
+        observations, actions = self._samples.batch(transitions)
+        policy = self._policy
+        if isinstance(policy, FlowPolicy):
+            return policy.cloning_losses(policy.actor_features(observations), actions.flatten(1))
+        log_prob: th.Tensor = policy.evaluate_actions(observations, actions)[1]
+        return -log_prob
 
     def _next_batch(self) -> np.ndarray:
         """The next transitions of a random order, in which each occurs before any does twice."""
@@ -145,8 +154,7 @@ class CloningRun:
         with preserve_rng_state(device), th.no_grad():
             self._validation_states.restore(device)
             for start in range(0, len(self._held), size):
-                batch = self._samples.batch(self._held[start : start + size])
-                total += cloning_losses(self._policy, *batch).sum().item()
+                total += self._losses_of(self._held[start : start + size]).sum().item()
         return total / len(self._held)
 
     # The state of a run in its file

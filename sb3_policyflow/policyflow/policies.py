@@ -1,5 +1,7 @@
 """Policies of PolicyFlow: an action is the end point of a flow plus Gaussian noise."""
 
+import math
+import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -32,6 +34,11 @@ class PolicyFlowOptions(FlowOptions, total=False):
 
 LATENT_STD = 0.2
 """Standard deviation of the latents, in half the distance of the actions' bounds."""
+
+CLONED_NOISE = 0.1
+"""Standard deviation of the noise after cloning, in half the distance of the actions' bounds; where
+there are none that mean something, as if they were -1 and 1."""
+HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class PolicyFlowRecord(NamedTuple):
@@ -171,6 +178,35 @@ class PolicyFlowPolicy(ContinuousFlowPolicy):
         if deterministic:
             return endpoints, record
         return endpoints + th.randn_like(endpoints) * self.noise_log_std.exp(), record
+
+    def cloning_losses(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """See :meth:`FlowPolicy.cloning_losses`; of a Gaussian policy, minus the log likelihood."""
+        if not self.gaussian:
+            return super().cloning_losses(features, actions)
+        latents = features.new_zeros(len(features), self.action_dim)
+        noise = (actions - self.transport(latents, features)) / self.noise_log_std.exp()
+        log_scales = self.noise_log_std + HALF_LOG_2_PI
+        return (0.5 * noise.square() + log_scales).sum(dim=-1)
+
+    def finish_cloning(self, noise_std: float | None) -> None:
+        """Set the noise, which a Gaussian policy has learned and keeps."""
+        if self.gaussian:
+            return
+        assert isinstance(self.action_space, spaces.Box)
+        ranges = half_ranges(self.action_space.low, self.action_space.high)
+        stds = CLONED_NOISE * np.where(np.isfinite(ranges), ranges, 1.0)
+        if noise_std is not None:
+            stds = np.full_like(stds, noise_std)
+        wanted = th.as_tensor(np.log(stds)).to(self.log_std)
+        with th.no_grad():
+            self.log_std.copy_(wanted)
+        self.keep_within_bounds()
+        if not th.allclose(self.log_std, wanted):
+            warnings.warn(
+                f"The noise after cloning is {self.log_std.exp().mean():.3g} and not "
+                f"{wanted.exp().mean():.3g}, because of log_std_bounds={self.log_std_bounds}.",
+                stacklevel=3,
+            )
 
 
 MlpFlowPolicy = PolicyFlowPolicy
