@@ -33,7 +33,7 @@ BELOW: dict[str, set[str]] = {
         "policyflow",
         "resilience",
     },
-    "imitation": {"common", "envs", "flows", "hints", "policyflow", "resilience"},
+    "imitation": {"common", "envs", "flows", "hints", "resilience"},
     "benchmark": {
         "callbacks",
         "common",
