@@ -39,6 +39,29 @@ from sb3_policyflow.resilience.finite import check_actions
 NetArch = list[int] | dict[str, list[int]]
 
 
+class CriticExtractor(MlpExtractor):
+    """The critic's hidden layers. The actor's belong to the velocity field.
+
+    :param features_dim: Size of the features.
+    :param layers: Hidden layers.
+    :param activation_fn: Their activation.
+    :param device: Where to put them.
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        layers: list[int],
+        activation_fn: type[nn.Module],
+        device: th.device,
+    ) -> None:
+        super().__init__(features_dim, {"pi": [], "vf": layers}, activation_fn, device)
+
+    def forward_actor(self, features: th.Tensor) -> th.Tensor:
+        """The features as they are."""
+        return features
+
+
 class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
     """An actor-critic policy whose actor is a velocity field.
 
@@ -161,11 +184,8 @@ class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
 
         If a subclass builds others, the velocity gets what their ``forward_actor`` returns.
         """
-        self.mlp_extractor = MlpExtractor(
-            self.features_dim,
-            net_arch={"pi": [], "vf": self._layers("vf")},
-            activation_fn=self.activation_fn,
-            device=self.device,
+        self.mlp_extractor = CriticExtractor(
+            self.features_dim, self._layers("vf"), self.activation_fn, self.device
         )
 
     def _build(self, lr_schedule: Schedule) -> None:

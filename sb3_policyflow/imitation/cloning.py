@@ -9,7 +9,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.common.algorithm import FlowOnPolicyAlgorithm
 from sb3_policyflow.imitation.demonstrations import load_demonstrations
 from sb3_policyflow.imitation.fitting import check_spaces
 from sb3_policyflow.imitation.options import CloningOptions
@@ -83,12 +83,10 @@ def clone(
     run = CloningRun(model, CloningSamples(model, shown), chosen)
     with _prepared(model, callback) as asked:
         run.train(asked, progress_bar)
-    policy = model.policy
-    if isinstance(policy, FlowPolicy):
-        policy.finish_cloning(chosen.noise_std)
-        state = policy.state_dict()
-        cloned = {name: values.cpu().numpy() for name, values in state.items()}
-        model.cloned_parameters = cloned  # type: ignore[attr-defined]
+    if isinstance(model, FlowOnPolicyAlgorithm):
+        model.policy.finish_cloning(chosen.noise_std)
+        state = model.policy.state_dict()
+        model.cloned_parameters = {name: values.cpu().numpy() for name, values in state.items()}
     return model
 
 

@@ -14,7 +14,7 @@ def read_critic(kernels: Kernels, inspector: ModuleInspector, policy: Any) -> ML
     """Read the critic behind the features, or raise :class:`UnsupportedError`."""
     inspector.children(policy)
     extractor = policy.mlp_extractor
-    if type(extractor) is not MlpExtractor:
+    if getattr(type(extractor), "forward_critic", None) is not MlpExtractor.forward_critic:
         raise UnsupportedError(f"{type(extractor).__name__} takes the place of SB3's MlpExtractor")
     inspector.children(extractor)
     hidden = extractor.value_net
