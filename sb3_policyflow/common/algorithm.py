@@ -204,10 +204,15 @@ class FlowOnPolicyAlgorithm(
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         super()._maybe_recommend_cpu(self.policy_aliases[mlp_class_name].__name__)
 
+    def _update_learning_rate(
+        self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
+    ) -> None:
+        options.take_up_changes(self)
+        super()._update_learning_rate(optimizers)
+
     @shares_cores
     def train(self) -> None:
         """Update the policy with the rollout in the buffer (paper, algorithm 1, lines 13 to 23)."""
-        options.take_up_changes(self)
         self._update_learning_rate(self.policy.optimizer)
         rollout = self._rollout()
         self.policy.set_training_mode(False)

@@ -27,13 +27,13 @@ class ContinuousFlowPolicy(FlowPolicy):
         return self.flow.n_evaluations
 
     def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """End points of the flow, see :meth:`FlowPolicy.transport`."""
+        """End points of the flow, see :meth:`LatentPolicy.transport`."""
         return self.flow.solve(latents, features)
 
     def choose_latents(
         self, candidates: th.Tensor, features: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
-        """See :meth:`FlowPolicy.choose_latents`."""
+        """As in the base class."""
         flow, carry = self.flow, getattr(self.transport, "__func__", None)
         is_plain = type(flow) is Flow and isinstance(flow.velocity, VelocityField)
         if is_plain and carry is ContinuousFlowPolicy.transport:

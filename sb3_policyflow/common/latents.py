@@ -14,9 +14,10 @@ LatentsAndEnds = tuple[th.Tensor, th.Tensor | None]
 
 
 class LatentPolicy(ABC):
-    """What a policy draws its actions from: latents, and where a flow transports them.
+    """A policy that draws latents and transports them to actions.
 
-    A policy adds the flow, :meth:`transport`, and the spread of its latents, :attr:`latent_scale`.
+    A subclass adds the flow (:meth:`transport`) and the spread of its latents
+    (:attr:`latent_scale`).
     """
 
     deterministic_action: str

@@ -57,7 +57,7 @@ class ScheduledOnPolicyAlgorithm(OnPolicyAlgorithm):
         if self.learning_rate is not learning_rate:
             self._setup_lr_schedule()
 
-    def critic_rate(self) -> float | None:
+    def critic_learning_rate_now(self) -> float | None:
         """The present learning rate of the critic's own parameters; None for that of the actor."""
         return None if self.critic_learning_rate is None else self.value_of("critic_learning_rate")
 
@@ -74,7 +74,7 @@ class ScheduledOnPolicyAlgorithm(OnPolicyAlgorithm):
         self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer
     ) -> None:
         self._start_adaptive_learning_rate()
-        if (rate := self.critic_rate()) is not None:
+        if (rate := self.critic_learning_rate_now()) is not None:
             self.logger.record("train/critic_learning_rate", rate)
         if self.adaptive_learning_rate is None:
             super()._update_learning_rate(optimizers)

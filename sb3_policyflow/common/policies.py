@@ -58,8 +58,10 @@ class CriticExtractor(MlpExtractor):
         super().__init__(features_dim, {"pi": [], "vf": layers}, activation_fn, device)
 
     def forward_actor(self, features: th.Tensor) -> th.Tensor:
-        """The features as they are."""
-        return features
+        """The features as they are, unless somebody has put layers there."""
+        network = self.policy_net
+        is_empty = type(network) is nn.Sequential and len(network) == 0
+        return features if is_empty else super().forward_actor(features)
 
 
 class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
@@ -300,7 +302,9 @@ class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
         return actions.reshape(-1, *self.action_space.shape)
 
     def cloning_losses(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """The losses of demonstrated actions, whose mean cloning minimizes, shape (n,).
+        """Losses of demonstrated actions, shape (n,); cloning minimizes their mean.
+
+        By default those of flow matching, along the points that ``draw_matching`` draws.
 
         :param features: The actor's features, shape (n, features_dim).
         :param actions: What was demonstrated, shape (n, action_dim).
@@ -308,7 +312,7 @@ class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):
         return matching_losses(self, features, actions)
 
     def finish_cloning(self, noise_std: float | None) -> None:
-        """Let what depends on the actor follow it once it was cloned from demonstrations.
+        """Called when the actor was cloned from demonstrations; does nothing by default.
 
         :param noise_std: Standard deviation of the noise to go on with, see
             :func:`sb3_policyflow.imitation.clone`; None for the default.

@@ -101,7 +101,7 @@ class FlowUpdate(ABC):
         self.surrogate_weights: th.Tensor | None = None
         self.trains_actor: bool = algorithm.n_rollouts >= algorithm.n_critic_warmup
         self.critic_rate: OwnRate | None = None
-        if (rate := algorithm.critic_rate()) is not None:
+        if (rate := algorithm.critic_learning_rate_now()) is not None:
             self.critic_rate = OwnRate(frozenset(self.policy.critic_parameters()), rate)
         self.pull: ImitationPull | None = None
         if (coef := algorithm.value_of("imitation_coef")) > 0:

@@ -190,9 +190,8 @@ class DPPOPolicy(FlowPolicy):
             if self._has_own_networks:
                 self.base_mlp_extractor.load_state_dict(self.mlp_extractor.state_dict())
 
-    def finish_cloning(self, noise_std: float | None) -> None:
+    def finish_cloning(self, noise_std: float | None) -> None:  # noqa: ARG002
         """Freeze what was cloned; the noise is the chain's own."""
-        super().finish_cloning(noise_std)
         self.freeze_base()
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
@@ -272,7 +271,7 @@ class DPPOPolicy(FlowPolicy):
         return self._bounded(points[-1]), record
 
     def transport(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
-        """Transport latents x_0 along the means of all steps, see :meth:`FlowPolicy.transport`."""
+        """Transport latents x_0 along the means of all steps; see the base class."""
         points, _ = self._chain(latents, features, is_noisy=False)
         return self._bounded(points[-1])
 

@@ -42,7 +42,8 @@ def clone(
     Logged are ``imitation/loss``, ``validation_loss``, ``best_validation_loss``, ``learning_rate``
     and ``gradient_steps``. Callbacks are asked after each gradient step, and may stop the cloning.
 
-    >>>     >>> from sb3_policyflow import PolicyFlow
+    >>> import numpy as np
+    >>> from sb3_policyflow import PolicyFlow
     >>> shown = np.random.randn(256, 3), np.zeros((256, 1))
     >>> model = clone(PolicyFlow("MlpPolicy", "Pendulum-v1"), shown, gradient_steps=20)
 

@@ -112,7 +112,7 @@ class CloningRun:
         self.step += 1
 
     def _losses_of(self, transitions: np.ndarray) -> th.Tensor:
-        """The losses of transitions, given by their numbers, shape (n,)."""
+        """The losses of transitions, given by their indices, shape (n,)."""
         observations, actions = self._samples.batch(transitions)
         policy = self._policy
         if isinstance(policy, FlowPolicy):

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.torch_layers import MlpExtractor
 
-from sb3_policyflow.kernels.inspection import KernelView, ModuleInspector, UnsupportedError
+from sb3_policyflow.kernels.inspection import KernelView, ModuleInspector
 from sb3_policyflow.kernels.layouts import Kernels
 from sb3_policyflow.kernels.mlp import MLP, evaluate_mlp, read_mlp
 
@@ -14,12 +14,10 @@ def read_critic(kernels: Kernels, inspector: ModuleInspector, policy: Any) -> ML
     """Read the critic behind the features, or raise :class:`UnsupportedError`."""
     inspector.children(policy)
     extractor = policy.mlp_extractor
-    if getattr(type(extractor), "forward_critic", None) is not MlpExtractor.forward_critic:
-        raise UnsupportedError(f"{type(extractor).__name__} takes the place of SB3's MlpExtractor")
-    inspector.children(extractor)
-    hidden = extractor.value_net
-    inspector.require_no_hooks(extractor, hidden)
-    return read_mlp(kernels, inspector, [*inspector.children(hidden), policy.value_net])
+    inspector.require_method(extractor, "forward_critic", MlpExtractor.forward_critic)
+    inspector.require_no_hooks(extractor)
+    hidden = inspector.sequence(extractor, "value_net")
+    return read_mlp(kernels, inspector, [*hidden, policy.value_net])
 
 
 class KernelCritic:

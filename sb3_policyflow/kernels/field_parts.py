@@ -1,7 +1,6 @@
 """What a velocity field consists of, for those who read its memory."""
 
 import torch as th
-from torch import nn
 
 from sb3_policyflow.flows import FourierTimeEmbedding, VelocityField
 from sb3_policyflow.kernels.inspection import Layer, ModuleInspector, UnsupportedError, are_usable
@@ -60,16 +59,16 @@ class FieldParts:
 def read_field(kernels: Kernels, inspector: ModuleInspector, field: VelocityField) -> FieldParts:
     """Read the parts of a field, or raise :class:`UnsupportedError`."""
     embedding = inspector.child(field, "time_embedding")
-    hidden = inspector.child(field, "hidden")
-    if type(embedding) is not FourierTimeEmbedding or not isinstance(hidden, nn.Sequential):
+    if type(embedding) is not FourierTimeEmbedding:
         raise UnsupportedError("the velocity field has other parts than VelocityField's")
-    mlp = inspector.child(embedding, "mlp")
-    inspector.require_no_hooks(field, hidden, embedding, mlp)
+    inspector.require_no_hooks(field, embedding)
     return FieldParts(
         inspector.parameter(embedding, "frequencies"),
-        read_mlp(kernels, inspector, inspector.children(mlp)),
+        read_mlp(kernels, inspector, inspector.sequence(embedding, "mlp")),
         inspector.layer(inspector.child(field, "observation_embedding")),
         read_mlp(
-            kernels, inspector, [*inspector.children(hidden), inspector.child(field, "output")]
+            kernels,
+            inspector,
+            [*inspector.sequence(field, "hidden"), inspector.child(field, "output")],
         ),
     )

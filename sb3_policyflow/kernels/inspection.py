@@ -73,6 +73,26 @@ class ModuleInspector:
         """All modules within a module."""
         return [self.child(module, name) for name in module._modules]
 
+    def sequence(self, module: nn.Module, name: str) -> list[Any]:
+        """What is in an ``nn.Sequential`` within a module.
+
+        :raises UnsupportedError: If it is a module of another class, or has hooks.
+        """
+        sequence = self.child(module, name)
+        if type(sequence) is not nn.Sequential:
+            raise UnsupportedError(f"{type(sequence).__name__} takes the place of a sequence")
+        self.require_no_hooks(sequence)
+        return self.children(sequence)
+
+    def require_method(self, module: nn.Module, name: str, method: object) -> None:
+        """Refuse a module whose method is another one than that of its known class.
+
+        :raises UnsupportedError: If it is.
+        """
+        if getattr(type(module), name, None) is not method or name in vars(module):
+            raise UnsupportedError(f"{type(module).__name__} has a {name} of its own")
+        self._places.append((vars(module), name, None))
+
     def parameter(self, module: nn.Module, name: str) -> Any:
         """A parameter of a module."""
         parameter: Any = module._parameters[name]

@@ -180,7 +180,7 @@ class PolicyFlowPolicy(ContinuousFlowPolicy):
         return endpoints + th.randn_like(endpoints) * self.noise_log_std.exp(), record
 
     def cloning_losses(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """See :meth:`FlowPolicy.cloning_losses`; of a Gaussian policy, minus the log likelihood."""
+        """As in the base class; of a Gaussian policy, minus the log likelihood."""
         if not self.gaussian:
             return super().cloning_losses(features, actions)
         latents = features.new_zeros(len(features), self.action_dim)

@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_policyflow import DPPO
+from sb3_policyflow.common.policies import FlowPolicy
 from tests.helpers import SMALL, TINY, train, weights
 
 
@@ -53,7 +54,13 @@ def deeper(self: Any) -> None:
     self.mlp_extractor = MlpExtractor(self.features_dim, arch, nn.ReLU)
 
 
-@pytest.mark.parametrize("build", [own_networks, deeper])
+def replaced(self: Any) -> None:
+    FlowPolicy._build_mlp_extractor(self)
+    self.mlp_extractor.policy_net = nn.Sequential(nn.Linear(self.features_dim, 16), nn.ReLU())
+    self.mlp_extractor.latent_dim_pi = 16
+
+
+@pytest.mark.parametrize("build", [own_networks, deeper, replaced])
 @pytest.mark.parametrize("share", [True, False])
 def test_an_actor_of_ones_own_acts_and_learns(
     algorithm: type[Any], build: Any, share: bool, tmp_path: Any

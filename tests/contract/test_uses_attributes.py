@@ -186,6 +186,18 @@ def test_set_in_a_callback(any_algorithm: type[Any], name: str, value: Any) -> N
     assert th.equal(trained(new(any_algorithm), change), given(any_algorithm, **{name: value}))
 
 
+def test_a_train_of_ones_own_takes_up_changes(algorithm: type[Any]) -> None:
+    """Whoever writes ``train`` begins, as SB3's PPO does, with the learning rate."""
+
+    class Own(algorithm):  # type: ignore[misc, valid-type]
+        def train(self) -> None:
+            self._update_learning_rate(self.policy.optimizer)
+
+    model = Own("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu")
+    model.learn(8, Each(lambda callback: setattr(callback.model, "learning_rate", 1e-5)))
+    assert model.policy.optimizer.param_groups[0]["lr"] == 1e-5
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "name", "value"), OURS)
 def test_ours_set_after_construction(algorithm: type[Any], name: str, value: Any) -> None:

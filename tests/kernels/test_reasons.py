@@ -9,6 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_policyflow import DPPO, PolicyFlow
+from sb3_policyflow.common.policies import CriticExtractor
 from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.kernels.activations import KNOWN
@@ -50,6 +51,42 @@ def mix_activations(policy: Any) -> None:
     policy.velocity.hidden[1] = nn.ReLU()
 
 
+class Doubled(nn.Sequential):
+    """Layers that do more than a sequence of them."""
+
+    def forward(self, features: th.Tensor) -> Any:
+        return 2.0 * super().forward(features)
+
+
+def replace_hidden_layers(policy: Any) -> None:
+    policy.velocity.hidden = Doubled(*policy.velocity.hidden)
+
+
+def replace_time_embedding(policy: Any) -> None:
+    embedding = policy.velocity.time_embedding
+    embedding.mlp = Doubled(*embedding.mlp)
+
+
+def replace_critic(policy: Any) -> None:
+    policy.mlp_extractor.value_net = Doubled(*policy.mlp_extractor.value_net)
+
+
+def set_forward_critic(policy: Any) -> None:
+    networks = policy.mlp_extractor
+    networks.forward_critic = lambda features: networks.value_net(features) + 1.0
+
+
+class Shifted(CriticExtractor):
+    """The critic's layers, differently used."""
+
+    def forward_critic(self, features: th.Tensor) -> th.Tensor:
+        return super().forward_critic(features) + 1.0
+
+
+def derive_critic(policy: Any) -> None:
+    policy.mlp_extractor = Shifted(3, [64, 64], nn.Tanh, policy.device)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -61,12 +98,29 @@ def mix_activations(policy: Any) -> None:
         (replace_field, "VelocityField is not a velocity field of kernels"),
         (replace_layer, "LazyLinear takes the place of a linear layer"),
         (mix_activations, "a network is not linear layers with one activation between them"),
+        (replace_hidden_layers, "Doubled takes the place of a sequence"),
+        (replace_time_embedding, "Doubled takes the place of a sequence"),
+        (replace_critic, "for the critic, Doubled takes the place of a sequence"),
+        (set_forward_critic, "for the critic, CriticExtractor has a forward_critic of its own"),
+        (derive_critic, "for the critic, Shifted has a forward_critic of its own"),
     ],
 )
 def test_what_was_done_to_a_policy(change: Callable[[Any], object], reason: str) -> None:
     policy = make_policy()
+    assert reason_kernels_are_off(policy) is None
     change(policy)
     assert reason_kernels_are_off(policy) == reason
+
+
+@pytest.mark.parametrize("change", [replace_critic, set_forward_critic, derive_critic])
+def test_a_critic_of_ones_own_has_its_own_values(change: Callable[[Any], object]) -> None:
+    policy = make_policy()
+    features = th.rand(5, 3)
+    before = policy.values(features)  # has read the critic
+    change(policy)
+    expected = policy.value_net(policy.mlp_extractor.forward_critic(features))
+    th.testing.assert_close(policy.values(features), expected, rtol=0, atol=0)
+    assert not th.allclose(expected, before)
 
 
 @pytest.mark.parametrize("activation", [nn.Hardtanh(-2, 2), nn.Softplus(threshold=5)])
