@@ -13,7 +13,6 @@ from sb3_policyflow.common import checks, names, options
 from sb3_policyflow.common.buffers import DictFlowRolloutBuffer, FlowRolloutBuffer
 from sb3_policyflow.common.former_names import keep_former_defaults
 from sb3_policyflow.common.graphs import record_losses
-from sb3_policyflow.common.learning_rates import ScheduledOnPolicyAlgorithm
 from sb3_policyflow.common.minibatches import (
     FlowRolloutBufferSamples,
     Minibatches,
@@ -25,6 +24,7 @@ from sb3_policyflow.common.optimization import (
     take_step,
 )
 from sb3_policyflow.common.policies import FlowPolicy
+from sb3_policyflow.common.scheduled import ScheduledOnPolicyAlgorithm
 from sb3_policyflow.common.schedules import (
     Coefficient,
     KLAdaptiveLearningRate,

@@ -1,4 +1,4 @@
-"""The learning rates of an algorithm: scheduled, following the divergence, or the critic's own."""
+"""An on-policy algorithm of SB3 whose rates and coefficients may change as it learns."""
 
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
