@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_policyflow.common import checks
+from sb3_policyflow.common.critic import CriticExtractor
 from sb3_policyflow.common.former_names import FormerAttribute, accepts_former_names
 from sb3_policyflow.common.latents import LatentPolicy
 from sb3_policyflow.common.losses import matching_losses
@@ -37,31 +38,6 @@ from sb3_policyflow.kernels import (
 from sb3_policyflow.resilience.finite import check_actions
 
 NetArch = list[int] | dict[str, list[int]]
-
-
-class CriticExtractor(MlpExtractor):
-    """The critic's hidden layers. The actor's belong to the velocity field.
-
-    :param features_dim: Size of the features.
-    :param layers: Hidden layers.
-    :param activation_fn: Their activation.
-    :param device: Where to put them.
-    """
-
-    def __init__(
-        self,
-        features_dim: int,
-        layers: list[int],
-        activation_fn: type[nn.Module],
-        device: th.device,
-    ) -> None:
-        super().__init__(features_dim, {"pi": [], "vf": layers}, activation_fn, device)
-
-    def forward_actor(self, features: th.Tensor) -> th.Tensor:
-        """The features as they are, unless somebody has put layers there."""
-        network = self.policy_net
-        is_empty = type(network) is nn.Sequential and len(network) == 0
-        return features if is_empty else super().forward_actor(features)
 
 
 class FlowPolicy(LatentPolicy, WithoutLikelihood, ActorCriticPolicy):

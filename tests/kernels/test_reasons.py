@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_policyflow import DPPO, PolicyFlow
-from sb3_policyflow.common.policies import CriticExtractor
+from sb3_policyflow.common.critic import CriticExtractor
 from sb3_policyflow.flows import VelocityField
 from sb3_policyflow.kernels import reason_kernels_are_off
 from sb3_policyflow.kernels.activations import KNOWN
