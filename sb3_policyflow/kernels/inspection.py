@@ -175,9 +175,8 @@ class _Reading(Generic[P]):
         tensors = self.parts.tensors
         if [tensor.data_ptr() for tensor in tensors] != self.parts.places:
             return False
-        float32 = th.float32
         for tensor in tensors:
-            if tensor.dtype is not float32 or not tensor.is_contiguous():
+            if tensor.dtype is not th.float32 or not tensor.is_contiguous():
                 return False
         return [tensor.shape for tensor in tensors] == self.parts.shapes
 

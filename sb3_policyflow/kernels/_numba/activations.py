@@ -1,18 +1,24 @@
-"""Activations: loops over formulas that the compiler turns into vector instructions.
+"""Activations: loops over :mod:`~.formulas`.
 
-All come down to one exponential or, for tanh, one division, and differ from torch's by a few units
-in the last place. Each is compiled when a network first has it, apart from the kernels, which call
-it by its address.
+Each is compiled when a network first has it, apart from the kernels, which call it by its address.
 """
 
-import math
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 
-from sb3_policyflow.kernels._numba.options import F, called, exact
+from sb3_policyflow.kernels._numba.formulas import (
+    elu_of,
+    exp,
+    gelu_parts,
+    mish_parts,
+    normal_cdf,
+    sigmoid_of,
+    softplus_of,
+    tanh_of,
+)
+from sb3_policyflow.kernels._numba.options import F, called
 from sb3_policyflow.kernels._numba.views import intrinsic, vector
 from sb3_policyflow.kernels.activations import (
     ELU,
@@ -30,122 +36,19 @@ from sb3_policyflow.kernels.activations import (
 )
 
 
-@exact
-def _exp_parts(x: Any) -> Any:
-    """(m, s) with e^x = s (1 + m), where s is a power of two and |m| < 0.42; NaN stays NaN.
-
-    The polynomial is that of Cephes' expf.
-    """
-    x = F(88.0) if x > F(88.0) else x
-    x = F(-87.0) if x < F(-87.0) else x
-    n = np.floor(x * F(1.44269504) + F(0.5))
-    r = (x - n * F(0.693359375)) - n * F(-2.12194440e-4)
-    p = F(1.9875691500e-4)
-    p = p * r + F(1.3981999507e-3)
-    p = p * r + F(8.3334519073e-3)
-    p = p * r + F(4.1665795894e-2)
-    p = p * r + F(1.6666665459e-1)
-    p = p * r + F(5.0000001201e-1)
-    scale = np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
-    return p * (r * r) + r, scale
-
-
-@exact
-def _exp(x: Any) -> Any:
-    m, s = _exp_parts(x)
-    return m * s + s
-
-
-@exact
-def _tanh(x: Any) -> Any:
-    """X P(x^2) / Q(x^2), fitted up to x = 9 and 1 beyond: within five units in the last place.
-
-    With an exponential it would take twice as long. 1 - tanh(x)^2 is off by 6e-7 at most.
-    """
-    x = F(9.0) if x > F(9.0) else x
-    x = F(-9.0) if x < F(-9.0) else x
-    square = x * x
-    p = F(1.33546481e-8)
-    p = p * square + F(2.06090717e-5)
-    p = p * square + F(3.49558727e-3)
-    p = p * square + F(1.33810252e-1)
-    p = p * square + F(1.0)
-    q = F(7.77655259e-7)
-    q = q * square + F(3.28563357e-4)
-    q = q * square + F(2.58769784e-2)
-    q = q * square + F(4.67143416e-1)
-    q = q * square + F(1.0)
-    y = x * p / q
-    y = F(1.0) if y > F(1.0) else y
-    return F(-1.0) if y < F(-1.0) else y
-
-
-@exact
-def _sigmoid(x: Any) -> Any:
-    return F(1.0) / (F(1.0) + _exp(-x))
-
-
-@exact
-def _elu(x: Any, alpha: Any) -> Any:
-    m, s = _exp_parts(x)
-    return x if x > F(0.0) else alpha * (m * s + (s - F(1.0)))
-
-
-@exact
-def _mish_parts(x: Any) -> Any:
-    """(u, w, 1 / (w + 2)) with u = e^x and w = u (u + 2): mish(x) = x w / (w + 2)."""
-    u = _exp(F(20.0) if x > F(20.0) else x)
-    w = u * (u + F(2.0))
-    return u, w, F(1.0) / (w + F(2.0))
-
-
-@exact
-def _normal_cdf(x: Any) -> Any:
-    """erfc(-x / sqrt(2)) / 2, with the Chebyshev fit of erfc in Numerical Recipes (1.2e-7)."""
-    z = abs(x) * F(0.70710678)
-    t = F(1.0) / (F(1.0) + F(0.5) * z)
-    p = t * F(0.17087277) - F(0.82215223)
-    p = p * t + F(1.48851587)
-    p = p * t - F(1.13520398)
-    p = p * t + F(0.27886807)
-    p = p * t - F(0.18628806)
-    p = p * t + F(0.09678418)
-    p = p * t + F(0.37409196)
-    p = p * t + F(1.00002368)
-    tail = F(0.5) * t * _exp(p * t - F(1.26551223) - z * z)
-    return F(1.0) - tail if x > F(0.0) else tail
-
-
-@exact
-def _gelu_parts(x: Any) -> Any:
-    """(gate, du/dx) with gate = (1 + tanh u) / 2 = sigmoid(2 u) and gelu(x) ~ x gate.
-
-    u = sqrt(2 / pi) (x + 0.044715 x^3)
-    """
-    square = F(0.044715) * x * x
-    u = F(0.79788456) * (x + square * x)
-    return _sigmoid(F(2.0) * u), F(0.79788456) * (F(1.0) + F(3.0) * square)
-
-
-@exact
-def _softplus(x: Any, beta: Any) -> Any:
-    scaled = beta * x
-    return x if scaled > F(20.0) else math.log1p(_exp(scaled)) / beta
-
-
 @called
 def mish(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     """mish'(x) = w / (w + 2) + 4 x u (u + 1) / (w + 2)^2."""
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            u, w, inverse = _mish_parts(x[i])
+            u, w, inverse = mish_parts(x[i])
             gate = w * inverse
             slopes[i] = gate + F(4.0) * x[i] * (u * (u + F(1.0)) * inverse) * inverse
             x[i] *= gate
     else:
         for i in range(size):
-            _, w, inverse = _mish_parts(x[i])
+            _, w, inverse = mish_parts(x[i])
             x[i] *= w * inverse
 
 
@@ -154,11 +57,11 @@ def tanh(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            x[i] = _tanh(x[i])
+            x[i] = tanh_of(x[i])
             slopes[i] = F(1.0) - x[i] * x[i]
     else:
         for i in range(size):
-            x[i] = _tanh(x[i])
+            x[i] = tanh_of(x[i])
 
 
 @called
@@ -190,12 +93,12 @@ def silu(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            gate = _sigmoid(x[i])
+            gate = sigmoid_of(x[i])
             slopes[i] = gate * (F(1.0) + x[i] * (F(1.0) - gate))
             x[i] *= gate
     else:
         for i in range(size):
-            x[i] *= _sigmoid(x[i])
+            x[i] *= sigmoid_of(x[i])
 
 
 @called
@@ -203,12 +106,12 @@ def elu(alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            y = _elu(x[i], alpha)
+            y = elu_of(x[i], alpha)
             slopes[i] = F(1.0) if x[i] > F(0.0) else y + alpha
             x[i] = y
     else:
         for i in range(size):
-            x[i] = _elu(x[i], alpha)
+            x[i] = elu_of(x[i], alpha)
 
 
 @called
@@ -216,12 +119,12 @@ def gelu(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            below = _normal_cdf(x[i])
-            slopes[i] = below + x[i] * F(0.39894228) * _exp(F(-0.5) * x[i] * x[i])
+            below = normal_cdf(x[i])
+            slopes[i] = below + x[i] * F(0.39894228) * exp(F(-0.5) * x[i] * x[i])
             x[i] *= below
     else:
         for i in range(size):
-            x[i] *= _normal_cdf(x[i])
+            x[i] *= normal_cdf(x[i])
 
 
 @called
@@ -229,12 +132,12 @@ def gelu_tanh(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            gate, slope = _gelu_parts(x[i])
+            gate, slope = gelu_parts(x[i])
             slopes[i] = gate * (F(1.0) + F(2.0) * x[i] * (F(1.0) - gate) * slope)
             x[i] *= gate
     else:
         for i in range(size):
-            x[i] *= _gelu_parts(x[i])[0]
+            x[i] *= gelu_parts(x[i])[0]
 
 
 @called
@@ -243,11 +146,11 @@ def softplus(alpha: Any, values: int, derivatives: int, size: int) -> None:
     if derivatives:
         for i in range(size):
             scaled = alpha * x[i]
-            slopes[i] = F(1.0) if scaled > F(20.0) else _sigmoid(scaled)
-            x[i] = _softplus(x[i], alpha)
+            slopes[i] = F(1.0) if scaled > F(20.0) else sigmoid_of(scaled)
+            x[i] = softplus_of(x[i], alpha)
     else:
         for i in range(size):
-            x[i] = _softplus(x[i], alpha)
+            x[i] = softplus_of(x[i], alpha)
 
 
 @called
@@ -269,11 +172,11 @@ def sigmoid(_alpha: Any, values: int, derivatives: int, size: int) -> None:
     x, slopes = vector(values, size), vector(derivatives, size)
     if derivatives:
         for i in range(size):
-            x[i] = _sigmoid(x[i])
+            x[i] = sigmoid_of(x[i])
             slopes[i] = x[i] * (F(1.0) - x[i])
     else:
         for i in range(size):
-            x[i] = _sigmoid(x[i])
+            x[i] = sigmoid_of(x[i])
 
 
 @called
